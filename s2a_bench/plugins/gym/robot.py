@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from ast import literal_eval
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Final, Literal
@@ -111,13 +112,16 @@ class GymRobot(TaskRobot):
         bounds = (space.start, space.start + space.n - 1) if self._discrete else (space.low, space.high)
         self._low, self._high = (np.ravel(bound).astype(np.float64) for bound in bounds)
         self._dims = self._low.size
+        place = _SLICE.fullmatch(kind.position)
+        self._place = slice(*map(int, place.groups())) if place else slice(0)
         self.begin(0)
-        first = self.state()
+        first = deepcopy(self._seen)
         self.begin(0)
-        if not np.allclose(self.state(), first, 1e-3, 1e-3):
-            raise RobotError(
-                f"`robot`: gym: {kind.env} begins differently after the same seed; its rows would not compare"
-            )
+        same = extras.require("gymnasium.utils.env_checker", "gym").data_equivalence
+        if not same(first, self._seen):
+            raise RobotError(f"`robot`: gym: {kind.env} begins differently with the same seed: rows would not compare")
+        if self._place.stop > (numbers := len(self.state())):
+            raise RobotError(f"`robot`: gym: {kind.position}: the state has {numbers} numbers")
 
     def begin(self, seed: int) -> None:
         with self._kind.called("cannot be reset"):
@@ -138,16 +142,16 @@ class GymRobot(TaskRobot):
             self._action = np.asarray(action, np.float64)
         elif self._kind.stall == "neutral":
             self._action = np.zeros(self._dims)
-        taken = np.clip(np.rint(self._action) if self._discrete else self._action, self._low, self._high)
         space = self._env.action_space
+        whole = np.issubdtype(space.dtype, np.integer)
+        taken = np.clip(np.rint(self._action) if whole else self._action, self._low, self._high)
         given = int(taken[0]) if self._discrete else taken.reshape(space.shape).astype(space.dtype)
         with self._kind.called("raised"):
             self._seen, reward, self._terminated, self._truncated, info = self._env.step(given)
         self._reward += float(reward)
         said = _said(info)
         self._said = said if self._said is None else self._said or bool(said)
-        place = _SLICE.fullmatch(self._kind.position)
-        self._path.append(np.array(self.state()[slice(*map(int, place.groups()))]) if place else taken)
+        self._path.append(np.array(self.state()[self._place]) if self._kind.position else taken)
         self.over = bool(self._terminated or self._truncated or (self._kind.success == "info" and self._said))
 
     def state(self) -> tuple[float, ...]:
@@ -165,7 +169,7 @@ class GymRobot(TaskRobot):
         key = self._kind.picture
         if key == NONE:
             return None
-        with self._kind.called(f"cannot be rendered (picture={NONE} does without)"):
+        with self._kind.called(f"cannot be rendered (picture={NONE} does without)") if key == RENDER else nullcontext():
             pixels = np.array(self._env.render() if key == RENDER else self._at(key))
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:  # noqa: PLR2004 - RGB
             raise RobotError(f"`robot`: gym: picture: {key} is {pixels.dtype} {pixels.shape}, not uint8 (h, w, 3)")
@@ -191,9 +195,13 @@ class GymRobot(TaskRobot):
 
     def describe(self) -> dict[str, str]:
         kind = self._kind
-        facts = {"robot": "gym", "env": kind.env, **dict(kind.keywords), "success": kind.success, "stall": kind.stall}
-        named = _period(kind)[1] if round(self._period_s * 1e9) == _period(kind)[0] else "control_hz"
-        return {**facts, "period": f"{self._period_s * 1e3:g} ms, of {named}"}
+        keywords = "&".join(f"{name}={text}" for name, text in kind.keywords)
+        named = "control_hz"
+        with suppress(UsageError):  # it names none
+            named = _period(kind)[1] if round(self._period_s * 1e9) == _period(kind)[0] else named
+        period = f"{self._period_s * 1e3:g} ms, of {named}"
+        facts = {"robot": "gym", "env": kind.env, "keywords": keywords, "success": kind.success, "stall": kind.stall}
+        return {**facts, "period": period}
 
     def close(self) -> None:
         self._env.close()

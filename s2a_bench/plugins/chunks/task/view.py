@@ -50,8 +50,11 @@ def task_sentences(cells: Sequence[TaskCell], margin: float) -> Iterator[str]:
     """Yield the latency that each mode bears, and the success at every latency that is not one number."""
     for mode, of_mode in groupby(cells, lambda cell: cell.mode):
         group = list(of_mode)
+        without = next((cell for cell in group if cell.fixed_s == 0), None)
         judged = [cell for cell in group if cell.fixed_s and cell.lost_high is not None]
-        if judged:
+        if without and without.success_low <= margin:
+            yield f"{mode}: no latency is judged, as {share(without)} succeed without any."
+        elif judged:
             yield f"{mode} {borne(judged, margin)}."
         elif any(cell.fixed_s for cell in group):
             yield f"{mode}: no latency is judged without --latency 0."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
@@ -18,7 +19,7 @@ import numpy as np
 from s2a_bench.clock import VirtualClock
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.machine import environment
-from s2a_bench.machine.tuning import limit_threads
+from s2a_bench.machine.tuning import end_with_parent, limit_threads
 from s2a_bench.plugins.chunks.acting import frame_of
 from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.requester import SEEDS, check_length
@@ -79,7 +80,7 @@ def run_virtual(config: TaskVirtual, output: Path, progress: Progress) -> Path:
         facts = world.describe()
     cases = [
         TaskCase(robot, config.policy, config.prompt, name, mode, setting, source, config.steps, config.seed)
-        for source, (name, mode) in product(config.sources, control.modes.items())
+        for source, (name, mode) in product(map(_bare, config.sources), control.modes.items())
     ]
     cells = {case.cell: replace(origin, tokens="emulated", clock="virtual", profile=case.source.name) for case in cases}
     manifest = {
@@ -101,17 +102,29 @@ def run_virtual(config: TaskVirtual, output: Path, progress: Progress) -> Path:
         return writer.path
 
 
+def _bare(source: Source) -> Source:
+    """Return a source without what only other commands read of a recording: it is sent with every job."""
+    return replace(source, requests=(), service_ns=None)
+
+
 def _everywhere(jobs: Sequence[tuple[TaskCase, int]]) -> Iterator[EpisodeRow]:
     """Yield the episodes in their order, done on all cores of this process."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
     if cores == 1:
         yield from map(_episode, jobs)
         return
-    with ProcessPoolExecutor(cores, get_context("spawn"), initializer=limit_threads) as pool:
+    with ProcessPoolExecutor(cores, get_context("spawn"), initializer=_prepare) as pool:
         try:
             yield from pool.map(_episode, jobs, chunksize=max(1, min(16, len(jobs) // (8 * cores))))
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _prepare() -> None:
+    """Prepare a process: Ctrl-C is its parent's, which it does not outlive."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    limit_threads()
 
 
 @cache
@@ -146,7 +159,6 @@ def _episode(job: tuple[TaskCase, int]) -> EpisodeRow:
             acting.finish()
 
     acting = RobotTicks(case.mode, case.setting, send, ask, case.steps)
-    loop = ControlLoop([acting], clock)
-    loop.run()
+    ControlLoop([acting], clock).run()
     names = {"cell": case.cell, "mode": case.name, "latency": case.source.name}
     return episode_row(names, seed, acting.acted(), case.setting.period_ns, robot.outcome(), live=False)
