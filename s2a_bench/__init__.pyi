@@ -228,7 +228,6 @@ class _ChunksVirtual(_Run, total=False):
     horizon: int
     latency: _Several[str | float]
     modes: _Several[str]
-    robot: str
     rounding: Literal["floor", "ceil"]
     rules: _Several[str]
     seed: int

@@ -210,7 +210,7 @@ def test_its_robot_gets_the_actions_of_its_engine_in_its_mode(command: Command, 
     lines = (tmp_path / "actions.txt").read_text().splitlines()
     assert sum(line.startswith("action ") for line in lines) > 50
     assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["robot"] == {"robot": "toy-robot"}
-    assert "virtual time has no actions" in command("chunks", "--robot", "toy-robot", code=2).stderr
+    assert "--robot is an option of mode live" in command("chunks", "--robot", "toy-robot", code=2).stderr
 
 
 def test_its_robot_carries_out_skills(command: Command, tmp_path: Path) -> None:

@@ -152,7 +152,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "chunks-stability": lambda: drawn(chunks(SPREAD), "stability"),
     "chunks-triggers": lambda: drawn(chunks(f"{SPREAD},{SLOW_ONES}"), "triggers"),
     "chunks-reactions": lambda: drawn(chunks("80"), "reactions"),
-    "chunks-smoothness": lambda: drawn(chunks(SPREAD), "smoothness"),
 }
 
 

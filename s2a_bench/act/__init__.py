@@ -7,16 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol, TypeAlias, TypeGuard, TypeVar
+from typing import ClassVar, Final, Protocol, TypeAlias, TypeGuard, TypeVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import Call, Gap, SkillSet
 from s2a_bench.policy.parameters import build
 from s2a_bench.registry import Registry
 from s2a_bench.types import Pixels, Vector
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
 
 Report: TypeAlias = Callable[[str], None]
 """Called once, from any thread, when a skill has ended by itself: with an error, empty on success."""
@@ -49,20 +46,6 @@ class SkillRobot(Protocol):
         """Let go of the robot; may be called twice."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """Motion of a robot in K ticks with n steps each: arrays of shape (K, n, D), the first step when a tick begins.
-
-    The units are those of the actions, and s. A tick's action is in effect from its first step on.
-    """
-
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    jerk: Floats
-    """(acceleration - acceleration one control period before) / control period; at rest before the first tick."""
-
-
 class ActionRobot(Protocol):
     """A robot that executes actions. Called on the control loop's thread: every call returns at once."""
 
@@ -78,10 +61,6 @@ class ActionRobot(Protocol):
 
     def picture(self) -> Pixels | None:
         """Return the picture that a request sends, of this tick, uint8 (height, width, 3) RGB; None: a camera's."""
-        return None
-
-    def moved(self, most: int) -> tuple[Motion, Floats] | None:  # noqa: ARG002 - for subclasses
-        """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""
         return None
 
     def describe(self) -> dict[str, str]:
@@ -139,18 +118,9 @@ class ActionKind(RobotKind):
     """A kind of robot that takes one action per control tick."""
 
     lacks: ClassVar[str] = "takes no actions"
-    simulated: ClassVar[bool] = False
-    """Whether `respond` computes its motion from its actions."""
 
     def open_actions(self, dims: int, period_ns: int) -> ActionRobot:
         """Open a robot for actions of ``dims`` numbers, one every ``period_ns``; raises S2AError."""
-        raise NotImplementedError
-
-    def respond(self, actions: Floats, period_s: float) -> Motion:
-        """Return the motion under actions of shape (K, D), K >= 1, one every ``period_s``; NaN: the last one is held.
-
-        Raises ValueError for a first action that is NaN.
-        """
         raise NotImplementedError
 
 

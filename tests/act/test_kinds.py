@@ -14,7 +14,6 @@ from s2a_bench.act import ROBOTS, ActionKind, ActionRobot, SkillKind, SkillRobot
 from s2a_bench.act.call import CallableRobot
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import SkillSet, load_skills
-from s2a_bench.plugins.chunks.plant import Plant
 
 
 @pytest.fixture
@@ -29,14 +28,14 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_each_of_ours_can_do_one_or_both() -> None:
     found = {name: (issubclass(ROBOTS[name], SkillKind), issubclass(ROBOTS[name], ActionKind)) for name in ROBOTS}
-    assert found == {"timed": (True, False), "plant": (False, True), "ros": (True, True), "call": (True, True)}
+    assert found == {"timed": (True, False), "ros": (True, True), "call": (True, True), "gym": (False, True)}
 
 
 @pytest.mark.parametrize(
     ("written", "able", "message"),
     [
-        ("plant?damping=2", SkillKind, "`robot`: plant carries out no skills; timed, ros, call do"),
-        ("timed", ActionKind, "`robot`: timed takes no actions; ros, call, plant do"),
+        ("gym?env=Moon-v0", SkillKind, "`robot`: gym carries out no skills; timed, ros, call do"),
+        ("timed", ActionKind, "`robot`: timed takes no actions; ros, call, gym do"),
     ],
 )
 def test_one_that_cannot_is_refused_with_those_that_can(written: str, able: Any, message: str) -> None:
@@ -46,6 +45,13 @@ def test_one_that_cannot_is_refused_with_those_that_can(written: str, able: Any,
 
 
 def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
+    class Joints(ActionRobot):
+        def __init__(self, dims: int) -> None:
+            self._dims = dims
+
+        def state(self) -> tuple[float, ...]:
+            return (0.0,) * self._dims
+
     @dataclass(frozen=True)
     class Arm(SkillKind, ActionKind):
         stiff: bool = False
@@ -53,13 +59,13 @@ def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
         def open_skills(self, skills: SkillSet) -> SkillRobot:
             return CallableRobot(skills, {skill.name: lambda _: None for skill in skills.skills})
 
-        def open_actions(self, dims: int, period_ns: int) -> ActionRobot:
-            return Plant(20.0 if self.stiff else 2.0).open_actions(dims, period_ns)
+        def open_actions(self, dims: int, period_ns: int) -> ActionRobot:  # noqa: ARG002 - at any rate
+            return Joints(dims)
 
     offer.arm = Arm  # type: ignore[attr-defined]
     assert kind("arm?stiff=true", SkillKind) == Arm(stiff=True)
     assert isinstance(kind("arm", SkillKind).open_skills(load_skills("household")), CallableRobot)
-    assert kind("arm?stiff=true", ActionKind).open_actions(1, 1).describe()["frequency_hz"] == "20"
+    assert kind("arm?stiff=true", ActionKind).open_actions(3, 1).state() == (0, 0, 0)
     with pytest.raises(UsageError, match="`robot`: arm: 'soft' is no parameter; its parameters are stiff"):
         kind("arm?soft=true", ActionKind)
     with pytest.raises(UsageError, match="`robot`: timed takes no actions; ros, call, arm do"):

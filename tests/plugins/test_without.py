@@ -60,7 +60,8 @@ PLUGINS = {
     ],
     "chunks": [
         Named("chunks", "No such command 'chunks'", "--help", "chunks "),
-        Named("timeline --live --robot plant", "'plant' is none of timed, ros, call", "--help", "capacity "),
+        Named("capacity", "No such command 'capacity'", "--help", "capacity "),
+        Named("task", "No such command 'task'", "--help", "task "),
     ],
     "rclpy": [Named("latency --middleware rclpy", "--middleware: 'rclpy' is none of ", "latency --help-all", "rclpy")],
     "zenoh": [

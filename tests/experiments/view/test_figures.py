@@ -25,7 +25,7 @@ FIGURES = {
     "boundary": ("boundary",),
     "capacity": ("capacity",),
     "ccrb": ("scenario", "phase"),
-    "chunks": ("lanes", "stability", "triggers", "reactions", "smoothness"),
+    "chunks": ("lanes", "stability", "triggers", "reactions"),
     "latency": ("latency_bars", "stages", "distribution"),
     "throughput": ("throughput_bars", "gaps", "positions"),
     "timeline": ("timeline",),

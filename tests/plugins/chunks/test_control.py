@@ -20,6 +20,7 @@ from s2a_bench.harness.plan import RequestPlan, resolve
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.plugins.chunks.control import Acted, ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.modes import ControlSetting, Rounding, mode
+from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
 from s2a_bench.plugins.chunks.modes.cycles import NEVER, follow
 from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
 from s2a_bench.types import Action, Vector
@@ -127,7 +128,7 @@ def test_robot_is_sent_each_action_and_each_stall() -> None:
 
 def test_overlapping_actions_are_blended_as_virtual_time_says() -> None:
     setting, sent = ControlSetting(PERIOD_NS, HORIZON), []
-    chosen = mode("aggregate?trigger=3")
+    chosen = Aggregate(3)
     rng = np.random.default_rng(0)
     chunks = rng.normal(size=(12, HORIZON, 2)).astype(np.float32)
     latency_ns = rng.integers(0, 4 * PERIOD_NS, 12)

@@ -64,7 +64,7 @@ def test_a_run_gives_each_cell_until_its_last_token_without_warm_ups(make_run: M
 
 def exported(folder: Path, **options: Any) -> list[dict[str, str]]:
     file = folder / "delays.csv"
-    settings = {"robot": "", "rules": "", **options}
+    settings = {"rules": "", **options}
     run_virtual(ChunksVirtual(export_delays=file, **settings), folder / "runs", NullProgress())
     with file.open(newline="") as text:
         return list(csv.DictReader(text))
@@ -86,7 +86,7 @@ def test_drawn_latencies_are_written_with_their_d_and_read_back(rounding: str, t
 
 
 def test_what_is_replayed_is_what_was_exported(tmp_path: Path) -> None:
-    first = {"modes": "queue?trigger=4", "rules": "", "cycles": 200, "robot": ""}
+    first = {"modes": "queue?trigger=4", "rules": "", "cycles": 200}
     one = read_run(run_virtual(ChunksVirtual(export_delays=tmp_path / "d.csv", **first), tmp_path, NullProgress()))
     again = read_run(run_virtual(ChunksVirtual(latency=str(tmp_path / "d.csv"), **first), tmp_path, NullProgress()))
     columns = [name for name in one.table(REQUESTS).columns if name != "cell"]

@@ -31,7 +31,6 @@ from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.chunks.cells import ActingCell, LatencyDraw
-    from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant
     from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Mode, Ticks
     from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.policy import Floats
@@ -44,7 +43,6 @@ MOST_POINTS: Final = 64
 MEANS_TRIED: Final = 33
 REQUESTS_TRIED: Final = 2000
 """At each mean."""
-SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
 SHARES: Final = np.linspace(0, 1, 401)
 """Quantiles of reaction times that are stored: denser than a figure can show."""
 _SIDE: Final = 0.975
@@ -60,7 +58,7 @@ class ActedCell:
     """With actions as slow as the cell's."""
     cycles: Cycles
     ticks: Ticks
-    more: Mapping[str, Any]
+    more: Mapping[str, Any] = field(default_factory=dict)
     """Metrics that are measured, or override computed ones."""
     late_ns: Ints | None = None
     """Delay of each action after its due time; None in virtual time."""
@@ -247,7 +245,7 @@ def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Ite
             )
 
 
-def mean_rows(control: ControlPlan, drawn: LatencyDraw, follows: TrackingPlant | None) -> Iterator[MeanRow]:
+def mean_rows(control: ControlPlan, drawn: LatencyDraw) -> Iterator[MeanRow]:
     """Yield a row for each mode under the source's latencies scaled to means from 0 to H ticks."""
     setting, judged = control.setting, drawn.judged[:REQUESTS_TRIED]
     shape = judged / max(float(judged.mean()), 1.0)
@@ -256,13 +254,11 @@ def mean_rows(control: ControlPlan, drawn: LatencyDraw, follows: TrackingPlant |
         for name, mode in control.modes.items():
             cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
             share = measure(mode, cycles, ticks).stall_share
-            smooth = follows.measure(mode, cycles, ticks) if follows else {}
             yield MeanRow(
                 latency=drawn.source.name,
                 mode=name,
                 latency_s=mean_ns / 1e9,
                 stall_share=None if np.isnan(share) else share,
-                **{each: smooth.get(each) for each in SMOOTH},
             )
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator
 
-from s2a_bench.act import ROBOTS, ActionKind, TaskKind, kind
+from s2a_bench.act import ROBOTS, ActionKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
@@ -67,13 +67,6 @@ class ChunksOptions(ControlOptions):
     shown_ticks: int = option(
         120, "control ticks of each row that are drawn, and in virtual time kept", ge=0, le=100_000
     )
-    robot: str = option(
-        "plant",
-        "what takes the actions: plant?frequency_hz=5&damping=1, live also ros?topic=/NAME, call?function=MODULE:NAME; "
-        "empty text for none",
-        first=True,
-        names=lambda: ROBOTS,
-    )
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
     )
@@ -81,10 +74,6 @@ class ChunksOptions(ControlOptions):
     @property
     def setting(self) -> ControlSetting:
         return super().setting.slowed(self.slow_down)
-
-    @cached_property
-    def robot_kind(self) -> ActionKind | None:
-        return kind(self.robot, ActionKind) if self.robot else None
 
     @property
     def rules_tried(self) -> Sequence[str]:
@@ -97,15 +86,9 @@ class ChunksOptions(ControlOptions):
 
     def check(self) -> None:
         super().check()
-        _ = self.robot_kind  # raises UsageError
         file = self.export_delays
         if file is not None and (file.suffix != ".csv" or not file.parent.is_dir()):
             raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
-
-    def risks(self) -> Iterator[tuple[str, str, str]]:
-        yield from super().risks()
-        if self.robot_kind is not None and (risk := self.robot_kind.risk):
-            yield "robot", risk, self.robot
 
     def to_manifest(self) -> dict[str, Any]:
         return {**super().to_manifest(), "live": not self.virtual}
@@ -170,10 +153,6 @@ class ChunksVirtual(ChunksOptions):
         if self.export_delays is not None and len(self.sources) != 1:
             names = ", ".join(source.name for source in self.sources)
             raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
-        if self.robot_kind is not None and not self.robot_kind.simulated:
-            name = self.robot.partition("?")[0]
-            other = ", or run 's2a-bench task'" if isinstance(self.robot_kind, TaskKind) else ""
-            raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing{other}")
         for source in self.sources:
             recorded, learnt = source.recorded_ns, source.learnable(self.learnt)
             if recorded is not None and recorded.size - learnt < 2:  # noqa: PLR2004 - a boundary
@@ -190,9 +169,20 @@ class ChunksLive(ChunksOptions, ServedOptions):
     """Modes and rules in real time, on the answers of a server."""
 
     seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
+    robot: str = option(
+        "",
+        "what takes the actions: ros?topic=/NAME, call?function=MODULE:NAME, gym?env=ID [default: none]",
+        first=True,
+        names=lambda: ROBOTS,
+    )
+
+    @cached_property
+    def robot_kind(self) -> ActionKind | None:
+        return kind(self.robot, ActionKind) if self.robot else None
 
     def check(self) -> None:
         super().check()
+        _ = self.robot_kind  # raises UsageError
         if self.seconds * 1e9 < 2 * self.setting.period_ns:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"
@@ -209,3 +199,8 @@ class ChunksLive(ChunksOptions, ServedOptions):
             )
         if self.export_delays is not None and len(self.robots_requests.pipelines) > 1:
             raise UsageError("`export_delays`: of one `transport` at a time")
+
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        yield from super().risks()
+        if self.robot_kind is not None and (risk := self.robot_kind.risk):
+            yield "robot", risk, self.robot

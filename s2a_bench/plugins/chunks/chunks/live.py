@@ -24,7 +24,6 @@ from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stall_metrics, stalls_of
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes
 from s2a_bench.plugins.chunks.chunks.config import PROMISING
-from s2a_bench.plugins.chunks.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.plugins.chunks.control import Acted
 from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
 from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ticks
@@ -32,7 +31,7 @@ from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester
 
 if TYPE_CHECKING:
-    from s2a_bench.act import ActionKind, ActionRobot
+    from s2a_bench.act import ActionKind
     from s2a_bench.plugins.chunks.chunks.config import ChunksLive, RulesPlan
     from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.progress import Progress
@@ -58,7 +57,6 @@ class LiveResult:
     setting: ControlSetting
     acted: Acted
     requester: ChunkRequester
-    robot: ActionRobot | None
     triggers: tuple[int, ...] = ()
 
     def counted(self) -> tuple[Cycles, Ticks]:
@@ -84,15 +82,6 @@ class LiveResult:
         equal = [getattr(computed, each)[:length] == getattr(done, each)[:length] for each in ("chunk", "index", "age")]
         return float(np.all(equal, axis=0).sum()) / ticks
 
-    def smooth(self) -> dict[str, float]:
-        """Return the robot's smoothness, if it reports its motion; the policy's target is unknown."""
-        if self.robot is None or (moved := self.robot.moved(MOST_TICKS)) is None:
-            return {}
-        motion, actions = moved
-        first = int((self.acted.chunk >= 0).argmax())
-        chunk = self.acted.chunk[first : first + MOST_TICKS]
-        return smoothness(motion, actions, chunk)
-
     def timing(self) -> dict[str, float]:
         acted, period_ns = self.acted, self.setting.period_ns
         late_s, busy_s = acted.late_ns / 1e9, acted.busy_ns / 1e9
@@ -117,7 +106,7 @@ class LiveResult:
             raise TransportError(f"{self.cell.cell}: {latency_ns.size} chunks in {seconds:g} s; act for longer")
         judged = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
         cycles, ticks = self.counted()
-        more: dict[str, Any] = {"agreement": self.agreement(ticks), **self.timing(), **self.smooth()}
+        more: dict[str, Any] = {"agreement": self.agreement(ticks), **self.timing()}
         if ticks.stalled.any() and ticks.stalled[-1]:  # the run ends while it waits at a boundary
             stalls = stalls_of(cycles)
             more |= stall_metrics(stalls["stalled_cycles"] + 1, stalls["boundaries"] + 1)
@@ -164,7 +153,7 @@ def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
             launch.writer.update(robot={} if robot is None else robot.describe())
             ticks = max(2, round(plan.seconds * 1e9 / setting.period_ns))
             acting, requester = act(cell.acting, setting, sessions, launch, blocks, ticks=ticks, robot=robot)
-            live = LiveResult(cell, setting, acting.acted(), requester, robot, tuple(acting.stepper.triggers))
+            live = LiveResult(cell, setting, acting.acted(), requester, tuple(acting.stepper.triggers))
             acted = live.actions()
             keep_origin(launch.writer, cell.cell, sessions[0].origin)
             whole = acted.ticks.chunk.size  # what is measured is kept

@@ -18,10 +18,7 @@ _ticks = partial(mean, unit="ticks")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkRow:
-    """A mode and rule under a source of latencies.
-
-    u is the actions' unit, in virtual time the target's standard deviation.
-    """
+    """A mode and rule under a source of latencies."""
 
     cell: str
     mode: Annotated[str, about("With the parameters that are not at their defaults.")]
@@ -106,28 +103,6 @@ class ChunkRow:
         float | None, mean("jump", "By how many actions the robot is thrown at a boundary.", unit="actions")
     ]
     jump_max: Annotated[float | None, mean("max", "The greatest.", unit="actions")]
-    tracking_rms: Annotated[
-        float | None, mean("tracking", "Position of the plant less the target's, root mean square.", unit="u")
-    ]
-    tracking_rms_ideal: Annotated[
-        float | None,
-        mean("ideal", "The same, with a request in every tick and no latency.", unit="u", better="neither"),
-    ]
-    jerk_rms: Annotated[
-        float | None,
-        mean("jerk", "Change of acceleration over a control period, by it; root mean square.", unit="u/s^3"),
-    ]
-    jerk_rms_ideal: Annotated[
-        float | None,
-        mean("ideal", "The same, with a request in every tick and no latency.", unit="u/s^3", better="neither"),
-    ]
-    boundary_jump_mean: Annotated[
-        float | None, mean("jump", "From a chunk's last executed action to the next one's first.", unit="u")
-    ]
-    boundary_jump_p99: Annotated[float | None, mean("p99", "Its 99th percentile.", unit="u")]
-    action_step_mean: Annotated[
-        float | None, mean("step", "From one action to the next within a chunk.", unit="u", better="neither")
-    ]
     blocked_ticks: Annotated[int | None, _ticks("blocked", "Ticks in which the control loop waits for an answer.")]
     agreement: Annotated[
         float | None, share("alike, %", "Live: share of the ticks as the mode's arrays have them.", better="higher")
@@ -231,10 +206,6 @@ class MeanRow:
     mode: str
     latency_s: float
     stall_share: float | None
-    tracking_rms: float | None
-    tracking_rms_ideal: float | None
-    jerk_rms: float | None
-    jerk_rms_ideal: float | None
 
 
 CHUNKS: Final[Table[ChunkRow]] = Table("chunks", ChunkRow)

@@ -14,7 +14,6 @@ from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mea
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes, draw
 from s2a_bench.plugins.chunks.chunks.config import PROMISING, RulesPlan
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
-from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant, follower
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
@@ -39,8 +38,6 @@ class VirtualPlan:
     drawn: Sequence[LatencyDraw]
     """Of each source."""
     cells: Sequence[ActingCell]
-    follows: TrackingPlant | None
-    """The robot and its target; None without a robot, or with actions slowed down."""
     shown_ticks: int
     export_delays: Path | None
     manifest: dict[str, Any]
@@ -73,9 +70,7 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),
     }
-    plant = config.robot_kind if config.slow_down == 1 else None
-    follows = None if plant is None else follower(plant, control)
-    return VirtualPlan(control, rules, drawn, tried, follows, config.shown_ticks, config.export_delays, manifest)
+    return VirtualPlan(control, rules, drawn, tried, config.shown_ticks, config.export_delays, manifest)
 
 
 def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
@@ -97,21 +92,19 @@ def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path
         progress.stage("acting in virtual time")
         progress.expect(len(plan.cells))
         for cell in plan.cells:
-            acted = _acted(cell, setting.slowed(cell.slower), plan.follows)
+            acted = _acted(cell, setting.slowed(cell.slower))
             for table, rows in cell_rows(acted, plan.shown_ticks, plan.rules.epsilon, plan.control.seed).items():
                 writer.append(table, rows)
             progress.advance()
         if mode is not None:
             for drawn in plan.drawn:
                 writer.append(TRIGGERS, trigger_rows(mode, setting, drawn))
-        writer.append(MEANS, mean_rows(plan.control, first, plan.follows))
+        writer.append(MEANS, mean_rows(plan.control, first))
         if plan.export_delays is not None:
             write_delays(plan.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
         return writer.path
 
 
-def _acted(cell: ActingCell, setting: ControlSetting, follows: TrackingPlant | None) -> ActedCell:
+def _acted(cell: ActingCell, setting: ControlSetting) -> ActedCell:
     mode, latency_ns = cell.acting, cell.drawn.judged
-    cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
-    smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
-    return ActedCell(cell, setting, cycles, ticks, smooth)
+    return ActedCell(cell, setting, mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting))

@@ -23,7 +23,7 @@ A simulation has one latency per request, and ends before the first request with
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
@@ -229,16 +229,6 @@ class Mode(Protocol):
         from s2a_bench.plugins.chunks.modes.closed import Closed
 
         return Closed()
-
-    def blend(self, cycles: Cycles, ticks: Ticks) -> Iterator[tuple[Ints, Ints, Ints, Floats]]:  # noqa: ARG002
-        """Yield the components of executed actions as arrays: ticks, chunks, indices, weights; the newest chunks first.
-
-        The weights of a tick add up to 1.
-        """
-        import numpy as np
-
-        acted = np.flatnonzero(ticks.chunk >= 0)
-        yield acted, ticks.chunk[acted], ticks.index[acted], np.ones(acted.size)
 
     def blended_age(self, cycles: Cycles) -> Floats | None:  # noqa: ARG002 - for subclasses
         """Return the weighted mean age behind each executed action in ticks, shape (K,), NaN for no action.

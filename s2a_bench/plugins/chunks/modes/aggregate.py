@@ -74,6 +74,10 @@ class Aggregate(Mode):
         return assemble(request, usable, usable, first, until, ticks=int(leaves[-1]), horizon=horizon)
 
     def blend(self, cycles: Cycles, ticks: Ticks) -> Iterator[tuple[Ints, Ints, Ints, Floats]]:
+        """Yield the components of executed actions as arrays: ticks, chunks, indices, weights; the newest chunks first.
+
+        The weights of a tick add up to 1.
+        """
         weight = self.weight
         acted = np.flatnonzero(ticks.chunk >= 0)
         newest, index = ticks.chunk[acted], ticks.index[acted]

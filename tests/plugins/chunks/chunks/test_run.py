@@ -17,7 +17,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.chunks.build_rows import mean_age, reactions_s, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import cells, draw
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
-from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
+from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, METRICS, REQUESTS, TICKS
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.chunks.view import show
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
@@ -30,8 +30,7 @@ LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
 
 
 def ran(folder: Path, **options: Any) -> StoredRun:
-    """Return a run without a robot, whose motion takes longer than all the rest."""
-    return read_run(run_virtual(ChunksVirtual(**{"robot": "", **options}), folder, NullProgress()))
+    return read_run(run_virtual(ChunksVirtual(**options), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +53,17 @@ def test_every_mode_and_rule_has_a_row_under_every_latency_with_every_metric(run
     assert {*METRICS} <= {*table.columns}
     assert set(table["rounding"]) == {"floor"}
     assert set(table["provenance"]) == {"none/none/emulated/clock-virtual"}
+
+
+def test_at_the_sources_own_mean_a_mode_stalls_as_its_cell_does(tmp_path: Path) -> None:
+    run = ran(tmp_path, cycles=400)
+    table = run.table(MEANS)
+    assert len(table) == 4 * 33
+    assert sorted(table["latency_s"].unique()) == pytest.approx(np.linspace(0, 0.32, 33))
+    cells = run.table(CHUNKS).query("rule == 'given'").set_index("mode")
+    same = table[table["latency_s"] == 0.08].set_index("mode")
+    both = same["stall_share"], cells["stall_share"]
+    np.testing.assert_allclose(*both, rtol=0.1, atol=0.01)  # the mean that was drawn is not quite 80 ms
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
@@ -234,7 +244,7 @@ def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_
 
 def test_json_keeps_its_schema(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
-    options = ("--cycles", "50", "--robot", "", "--data-only", "--latency", latencies)
+    options = ("--cycles", "50", "--data-only", "--latency", latencies)
     done = called("chunks", "--json", *options, "--output", tmp_path)
     found = printed(done)
     assert found["command"] == "chunks"

@@ -100,27 +100,16 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
     assert lower.get_title(loc="left") == "lognormal:mean_ms=80,cv=.5"
 
 
-def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
-    table = show(run).tables["smoothness"]
-    assert table.header[3:] == ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
-    tracking, ideal = (float(text) for text in table.rows[0][3:5])
-    assert tracking > ideal > 0
-    assert any("of plant, in the target's standard deviation" in note for note in table.notes)
-    assert not any("P(stall)" in note for note in table.notes)
-    assert any(note.startswith("EMULATED") for note in table.notes)
-
-
 def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path) -> None:
-    assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions", "smoothness"]
-    config = ChunksVirtual(modes="sync", cycles=20, shown_ticks=0, robot="")
+    assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions"]
+    config = ChunksVirtual(modes="sync", cycles=20, shown_ticks=0)
     run = read_run(run_virtual(config, tmp_path, NullProgress()))
     assert list(EXPERIMENT.show(run).figures) == ["stability", "reactions"]
-    assert "smoothness" not in EXPERIMENT.show(run).tables
 
 
 @pytest.mark.parametrize("modes", ["sync", "sync,replace"])
 def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
-    config = ChunksVirtual(latency="60", modes=modes, rules="", cycles=100, robot="")
+    config = ChunksVirtual(latency="60", modes=modes, rules="", cycles=100)
     few = read_run(run_virtual(config, tmp_path, NullProgress()))
     assert len(lanes_of(few, ChunkCells.of(few))) == modes.count(",") + 1
     drawn(few, "lanes").savefig(tmp_path / "lanes.png")  # a warning where they have none
@@ -128,7 +117,7 @@ def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> Non
 
 @pytest.fixture(scope="module")
 def lanes_run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60, robot="")
+    config = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
     return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 

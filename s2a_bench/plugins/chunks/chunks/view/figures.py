@@ -1,4 +1,4 @@
-"""The figures of a run of chunks: lanes of control ticks, stalls and smoothness over latency, triggers, reactions."""
+"""The figures of a run of chunks: lanes of control ticks, stalls over latency, triggers, reactions."""
 
 from __future__ import annotations
 
@@ -39,8 +39,6 @@ COLOURS: Final = ("#0072B2", "#56B4E9", "#009E73")
 _BAR: Final = 0.34
 _AGE: Final = 0.42
 LINE_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-STALLS: Final = {"stall_share": "stalled share"}
-SMOOTHNESS: Final = {"tracking_rms": "tracking error (sd)", "jerk_rms": "jerk (sd/s$^3$)"}
 _RULES: Final = {"calibrated": "o", "tracked": "s", "maximum": "^", "mean": "v", "oracle": "*"}
 _INK: Final = "#222222"
 _MOST_PANELS: Final = 8
@@ -175,39 +173,31 @@ def chunk_figures(run: StoredRun, cells: ChunkCells, lanes: Sequence[CellTicks])
     if lanes:
         figures["lanes"] = partial(build_lanes, lanes, setting)
     if len(means):
-        figures["stability"] = partial(build_over_means, means, f"Stalled share of the ticks, {setting}", STALLS)
+        figures["stability"] = partial(build_stability, means, setting)
     if triggers:
         figures["triggers"] = partial(build_triggers, triggers, cells.sources, float(settings["epsilon"]), setting)
     if len(reactions):
         figures["reactions"] = partial(build_reactions, reactions, cells.sources, setting)
-    if means["tracking_rms"].notna().any():
-        figures["smoothness"] = partial(build_over_means, means, f"Following a target, {setting}", SMOOTHNESS)
     return figures
 
 
-def build_over_means(rows: pd.DataFrame, title: str, shown: Mapping[str, str]) -> Figure:
-    """Draw columns over mean latency, a panel each, a line a mode; dashed: a request in every tick, no latency."""
+def build_stability(rows: pd.DataFrame, setting: str) -> Figure:
+    """Draw the stalled share over mean latency, a line a mode."""
     modes = [str(mode) for mode in rows["mode"].unique()][: len(LINE_COLOURS)]
     columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1
-    foot_in = 0.17 * -(-(len(modes) + 1) // columns)
-    caption = (title, f"Latencies are those of {rows['latency'].iloc[0]}, all scaled by one factor.")
-    figure = new_figure(0.8 + 1.3 * len(shown) + foot_in, caption)
-    panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
+    more = f"Latencies are those of {rows['latency'].iloc[0]}, all scaled by one factor."
+    figure = new_figure(2.1 + 0.17 * -(-len(modes) // columns), (f"Stalled share of the ticks, {setting}", more))
+    axes = figure.subplots()
     latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
-    for axes, (name, label) in zip(panels, shown.items(), strict=True):
-        values = rows[name].to_numpy(dtype="float64", na_value=np.nan)
-        for mode, colour in zip(modes, LINE_COLOURS, strict=False):
-            mine = (rows["mode"] == mode).to_numpy()
-            axes.plot(latency_ms[mine], values[mine], color=colour, label=short(mode, LINE_CHARS - 8))
-        if f"{name}_ideal" in rows:
-            ideal = rows.groupby("latency_s")[f"{name}_ideal"].mean().to_numpy(dtype="float64")
-            axes.plot(np.unique(latency_ms), ideal, "--", color="black", label="a request in every tick, no latency")
-        axes.set_ylim(bottom=0)
-        axes.ticklabel_format(axis="y", scilimits=(-3, 5))
-        axes.set_ylabel(label)
-    panels[-1].set_xlim(0, float(latency_ms.max()))
-    panels[-1].set_xlabel("mean latency, L (ms)")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, columnspacing=1.0)
+    share = rows["stall_share"].to_numpy(dtype="float64", na_value=np.nan)
+    for mode, colour in zip(modes, LINE_COLOURS, strict=False):
+        mine = (rows["mode"] == mode).to_numpy()
+        axes.plot(latency_ms[mine], share[mine], color=colour, label=short(mode, LINE_CHARS - 8))
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(0, float(latency_ms.max()))
+    axes.set_ylabel("stalled share")
+    axes.set_xlabel("mean latency, L (ms)")
+    figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.0)
     return figure
 
 

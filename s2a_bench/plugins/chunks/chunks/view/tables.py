@@ -37,8 +37,6 @@ _LOOP_NOTE: Final = (
     "empty where they do not cover the arrivals; jitter: delay of an action after its due time; late: by a tick or "
     "more; busy: time of a tick spent on requests and sending, p99."
 )
-_MOTION: Final = ("jerk_rms", "boundary_jump_mean", "boundary_jump_p99", "action_step_mean")
-_FOLLOWING: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal", *_MOTION[1:])
 _TITLES: Final = {"execution_horizon": "s", "trigger": "m", **{name: metric.title for name, metric in METRICS.items()}}
 _SCALES: Final = {"s": 1e3, "bytes/s": 1e-6}
 """Unit -> factor: tables show times in ms, bytes in MB."""
@@ -86,22 +84,6 @@ class ChunkCells:
         return _CONVENTION[self.settings["rounding"]]
 
 
-def smoothness_table(cells: ChunkCells) -> TextTable | None:
-    """Return the table of the plant's smoothness under each mode; in virtual time, also of its tracking error."""
-    if all(row.jerk_rms is None for row in cells.rows):
-        return None
-    robot = cells.settings["robot"]
-    jump = "jump: from one action to the next across a boundary, step: within a chunk."
-    if cells.live:
-        note = f"Jerk (root mean square) of {robot}, in the actions' unit and s. {jump}"
-        return _table(cells, "Smoothness", _MOTION, (cells.convention, note))
-    note = (
-        f"Tracking error and jerk (root mean squares) of {robot}, in the target's standard deviation and s; ideal: "
-        f"with a request in every tick and no latency. {jump}"
-    )
-    return _table(cells, "Smoothness", _FOLLOWING, (cells.convention, note, _EMULATED))
-
-
 def chunk_tables(cells: ChunkCells) -> Tables:
     loop_notes = (cells.convention, _LOOP_NOTE)
     return {
@@ -109,7 +91,6 @@ def chunk_tables(cells: ChunkCells) -> Tables:
         "actions": lambda: _table(cells, "Actions: ages in ticks", _ACTIONS),
         "delays": lambda: delay_table(cells),
         "loop": lambda: _table(cells, "Control loop", _LOOP, loop_notes) if cells.live else None,
-        "smoothness": lambda: smoothness_table(cells),
     }
 
 
