@@ -16,6 +16,7 @@ from studies.config import StudyConfig
 from studies.delays import DelaysConfig, run_delays, show_delays
 from studies.output import Lines
 from studies.run import STUDIES, run_study, show_study
+from studies.task.study import TaskStudyConfig, build_task, run_task, show_task
 from studies.validity import ValidityConfig, run_validity, show_validity
 
 FIGURES: dict[str, dict[str, Any]] = {
@@ -48,9 +49,10 @@ def parser() -> argparse.ArgumentParser:
     for name, study in STUDIES.items():
         _command(commands, name, study.about, StudyConfig)
     _command(commands, "delays", "triggers where delays are not exchangeable", DelaysConfig)
+    _command(commands, "task", "what delay costs a task: experts of Meta-World in chunks", TaskStudyConfig)
     _command(commands, "validity", "valid skills in a model's plans, with a grammar and without", ValidityConfig)
     drawn = commands.add_parser("figures", help="draw the figures of README.md and docs/shift.md anew; minutes")
-    drawn.add_argument("figures", nargs="*", metavar="FIGURE", help=f"[default: {' '.join(FIGURES)}]")
+    drawn.add_argument("figures", nargs="*", metavar="FIGURE", help=f"[default: {' '.join(FIGURES)}], or task")
     drawn.add_argument("--output", type=Path, default=Path("results"), help="folder for run folders")
     return whole
 
@@ -64,10 +66,14 @@ def _command(commands: Any, name: str, about: str, options: type[Options]) -> No
 def draw(names: list[str], output: Path) -> None:
     """Run the studies that figures show, and draw these into docs/figures."""
     for name in names or FIGURES:
-        run = read_run(run_study(StudyConfig(name=name, **FIGURES[name]), output, Lines()))
+        if name == "task":
+            folder = run_task(TaskStudyConfig(), output, Lines())
+        else:
+            folder = run_study(StudyConfig(name=name, **FIGURES[name]), output, Lines())
+        build = build_task if name == "task" else STUDIES[name].figure
         path = Path(__file__).parent.parent / "docs" / "figures" / f"study-{name}.png"
         with paper_column():
-            STUDIES[name].figure(run).savefig(path, dpi=DPI)
+            build(read_run(folder)).savefig(path, dpi=DPI)
         print(path)
 
 
@@ -82,6 +88,9 @@ def main(arguments: list[str]) -> int:
         elif name == "delays":
             delays = DelaysConfig(**placed(DelaysConfig, given))
             show_delays(read_run(run_delays(delays, output, Lines())))
+        elif name == "task":
+            task = TaskStudyConfig(**placed(TaskStudyConfig, given))
+            show_task(read_run(run_task(task, output, Lines())))
         elif name == "validity":
             validity = ValidityConfig(**placed(ValidityConfig, given))
             show_validity(read_run(run_validity(validity, output, Lines())))
