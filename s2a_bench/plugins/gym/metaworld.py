@@ -9,8 +9,6 @@ from typing import Any
 from s2a_bench import extras
 from s2a_bench.types import Pixels, Vector
 
-warnings.filterwarnings("ignore", "Constant", module="metaworld")  # of every expert that asks for more than 1
-
 
 @cache
 def _experts() -> Any:
@@ -21,4 +19,6 @@ def expert(pictures: tuple[Pixels, ...], state: Vector, prompt: str) -> Any:  # 
     """Return one action, float32 (4,)."""
     if prompt not in _experts():
         raise ValueError(f"prompt '{prompt}' is no task of Meta-World, as push-v3")
-    return _experts()[prompt]().get_action(state)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # most experts ask for more than 1, which is clipped
+        return _experts()[prompt]().get_action(state)
