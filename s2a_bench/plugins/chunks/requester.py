@@ -108,9 +108,8 @@ class ChunkRequester:
     def _ask(self, session: Session, job: Job) -> None:
         """Repeat the request until its chunk is complete, or the run is over."""
         chunk: list[Vector] = []
-        if job.picture is not None and isinstance(session.feed, RequestFeed):
-            still: Any = Still(job.picture)  # of a source, `read` is what it needs
-            session.feed = replace(session.feed, source=still)
+        if job.picture is not None:
+            show(session, job.picture)
         for attempt in count():
             actions: list[Vector] = []
 
@@ -125,12 +124,11 @@ class ChunkRequester:
             place = Place(next(self.blocks), attempt, warmup=self.warmup > 0)
             request = replace(session.request, seed=(self.seed + job.tick) % SEEDS)
             measured = session.measure(place, RequestContext(job.state or None, on_piece, request=request))
-            if job.picture is not None:  # a world may well look the same twice
-                measured = replace(measured, fingerprint=place.block)
+            picture = measured.fingerprint if job.picture is None else place.block  # a world may look the same twice
             self.names[job.request] = measured.sample.request_id
             self.sent_bytes += measured.sample.payload_bytes or 0
             self.error = measured.sample.error
-            self.done.put((session, measured))
+            self.done.put((session, replace(measured, fingerprint=picture)))
             self.attempts += 1
             if self.attempts == self.warmup:
                 self.over.set()
@@ -140,6 +138,13 @@ class ChunkRequester:
                 return
             if measured.fatal is not None or self.over.wait(wait_s(measured)):
                 return
+
+
+def show(session: Session, picture: Frame) -> None:
+    """Let the session's next requests carry a robot's picture."""
+    still: Any = Still(picture)  # of a source, `read` is all that a feed needs
+    if isinstance(session.feed, RequestFeed):
+        session.feed = replace(session.feed, source=still)
 
 
 def wait_s(measured: Measured) -> float:
