@@ -127,7 +127,7 @@ class ActionKind(RobotKind):
 class TaskKind(ActionKind):
     """A kind of robot that does a task in a world of its own."""
 
-    lacks = "has no task"
+    lacks = "does no task"
 
     @property
     def period_ns(self) -> int:
@@ -161,7 +161,7 @@ def kind(written: str, able: type[_Able]) -> _Able:
     made_by = ROBOTS[name]
     if not _is(made_by, able):
         those = ", ".join(each for each, other in ROBOTS.loaded() if _is(other, able))
-        raise UsageError(f"`{ROBOTS.field}`: {name} {able.lacks}; {those} do")
+        raise UsageError(f"`{ROBOTS.field}`: {name} {able.lacks}; {those} {'do' if ',' in those else 'does'}")
     return build(made_by, written, ROBOTS.field)
 
 

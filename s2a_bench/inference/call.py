@@ -65,7 +65,7 @@ class CallEngine(Engine):
             yield from islice(chunk, request.max_tokens)
         except RequestFailed as error:
             raise EngineError(f"call: {self._name} answered with {error}") from error
-        except Exception as error:  # a user's function may raise anything
+        except (Exception, SystemExit) as error:  # a user's function may raise anything
             raise EngineError(f"call: {self._name}: {type(error).__name__}: {error}") from error
 
     def describe(self) -> dict[str, str | int | float | bool]:

@@ -56,7 +56,7 @@ WRONG = {
         ("--trnsport ros", "No such option: --trnsport; did you mean --transport?"),
         ("--transport http/best-efort", "; did you mean best-effort?"),
         ("--transport http?conection=x", "; did you mean connection?"),
-        ("--engine lama", "'lama' is none of llama, echo, replay; did you mean llama?"),
+        ("--engine lama", "'lama' is none of llama, echo, replay, call; did you mean llama?"),
         ("--url grpc+http://x", "--url: no installed transport speaks grpc+http://, only http://"),
         ("--payload gif", "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
         ("--url http://127.0.0.1:9 --transport http", "nothing answers at http://127.0.0.1:9", 1),

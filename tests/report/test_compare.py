@@ -217,7 +217,7 @@ def test_runs_of_two_commands_are_never_compared(launch: Launch, tmp_path: Path)
         pass
     computed = read_run(other.path)
     with pytest.raises(
-        UsageError, match="runs of boundary cannot be compared, only those of capacity, latency, throughput"
+        UsageError, match="runs of boundary cannot be compared, only those of capacity, latency, task, throughput"
     ):
         opened(computed, computed)
 

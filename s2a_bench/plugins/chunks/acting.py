@@ -64,7 +64,7 @@ def act(
     robot: ActionRobot | None = None,
     warmup: int = 0,
 ) -> tuple[RobotTicks, ChunkRequester]:
-    """Act for ``ticks``, to the end of an episode, or until ``warmup`` requests have been made; write the requests."""
+    """Act for ``ticks``, or to the end of a task's episode, or for ``warmup`` requests; write the requests."""
     sends_state = robot is not None and _accepts_state(sessions[0], robot)
 
     def request_chunk(request: int, tick: int) -> None:
@@ -75,7 +75,7 @@ def act(
     def send(action: Vector | None, at_ns: int) -> None:
         if robot is not None:
             robot.send(action, at_ns)
-        if isinstance(robot, TaskRobot) and robot.over:
+        if isinstance(robot, TaskRobot) and robot.over and not warmup:
             acting.finish()
 
     acting = RobotTicks(chosen, setting, send, request_chunk, ticks)

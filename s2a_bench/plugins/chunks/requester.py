@@ -145,6 +145,7 @@ def show(session: Session, picture: Frame) -> None:
     still: Any = Still(picture)  # of a source, `read` is all that a feed needs
     if isinstance(session.feed, RequestFeed):
         session.feed = replace(session.feed, source=still)
+        session.request = replace(session.request, size=f"{picture.width}x{picture.height}")
 
 
 def wait_s(measured: Measured) -> float:

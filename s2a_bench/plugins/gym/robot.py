@@ -56,7 +56,7 @@ class Gym(TaskKind):
         if self.position and not _SLICE.fullmatch(self.position):
             raise UsageError(f"position = '{self.position}' should look like state[0:3]")
         if (self.success == "return") == (self.least is None):
-            raise UsageError("least is the sum of rewards that success=return needs")
+            raise UsageError("success=return needs least=SUM of rewards, no other does")
 
     @property
     def period_ns(self) -> int:
@@ -74,7 +74,8 @@ class Gym(TaskKind):
             keywords[name] = text
             with suppress(ValueError, SyntaxError):
                 keywords[name] = literal_eval(text)
-        with self.called("cannot be made (of a package: env=PACKAGE:ID)", UsageError):
+        hints = "a package first: env=PACKAGE:ID; no render_mode: picture=none"
+        with self.called(f"cannot be made ({hints})", UsageError):
             env = gymnasium.make(self.env, disable_env_checker=True, **keywords)
         if not isinstance(env.action_space, (gymnasium.spaces.Box, gymnasium.spaces.Discrete)):
             raise UsageError(f"`robot`: gym: {self.env} takes actions of {env.action_space}, not of Box or Discrete")
@@ -196,10 +197,11 @@ class GymRobot(TaskRobot):
     def describe(self) -> dict[str, str]:
         kind = self._kind
         keywords = "&".join(f"{name}={text}" for name, text in kind.keywords)
-        named = "control_hz"
+        period = f"{self._period_s * 1e3:g} ms, of control_hz"
         with suppress(UsageError):  # it names none
-            named = _period(kind)[1] if round(self._period_s * 1e9) == _period(kind)[0] else named
-        period = f"{self._period_s * 1e3:g} ms, of {named}"
+            own_ns, name = _period(kind)
+            same = own_ns == round(self._period_s * 1e9)
+            period = f"{own_ns / 1e6:g} ms, of {name}" if same else f"{period}, not {own_ns / 1e6:g} ms, of {name}"
         facts = {"robot": "gym", "env": kind.env, "keywords": keywords, "success": kind.success, "stall": kind.stall}
         return {**facts, "period": period}
 

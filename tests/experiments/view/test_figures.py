@@ -14,6 +14,7 @@ from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
+from s2a_bench.plugins.chunks.task.config import TaskVirtual
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -26,6 +27,7 @@ FIGURES = {
     "capacity": ("capacity",),
     "ccrb": ("scenario", "phase"),
     "chunks": ("lanes", "stability", "triggers", "reactions"),
+    "task": ("task",),
     "latency": ("latency_bars", "stages", "distribution"),
     "throughput": ("throughput_bars", "gaps", "positions"),
     "timeline": ("timeline",),
@@ -45,16 +47,27 @@ def measured(name: str, _: Path, make_run: Any) -> StoredRun:
     return StoredRun(run.path, {**run.manifest, "command": name}, run.tables)
 
 
+POLE: dict[str, Any] = {
+    "robot": "gym?env=CartPole-v1&success=survival&picture=none",
+    "engine": {"name": "echo", "action_dim": 1},
+    "horizon": 1,
+    "modes": "sync",
+    "latency": "0,40,lognormal:mean_ms=30,cv=1",
+    "episodes": 1,
+    "steps": 3,
+}
 RUNS: dict[str, Make] = {
     "boundary": partial(computed, "boundary", BoundaryConfig(points=5, most_tokens=3)),
     "capacity": partial(computed, "capacity", CapacityPredicted(predict="40", robots="1..2", seconds=1)),
     "ccrb": partial(computed, "ccrb", CcrbComputed(phase=True, phase_points=(3, 2))),
     "chunks": partial(computed, "chunks", ChunksVirtual(cycles=50)),
     "latency": partial(measured, "latency"),
+    "task": partial(computed, "task", TaskVirtual(**POLE)),
     "throughput": partial(measured, "throughput"),
     "timeline": partial(computed, "timeline", TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))),
 }
 EMULATED, DUMMY = "no engine, tokens EMULATED, virtual time", "llama (DUMMY WEIGHTS), tokens PACED"
+LINES = {"latency": DUMMY, "throughput": DUMMY, "task": "echo (no model), tokens EMULATED, virtual time"}
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -66,7 +79,7 @@ def test_a_figure_has_one_line_of_provenance_and_a_caption(name: str, tmp_path: 
     assert tuple(figures) == FIGURES[name]
     for figure in figures.values():
         line = figure.get_suptitle()
-        assert line == f"{DUMMY if name in {'latency', 'throughput'} else EMULATED} · {host} · {day}"
+        assert line == f"{LINES.get(name, EMULATED)} · {host} · {day}"
         title, *notes, origin = caption_of(figure)
         assert title
         assert not title.endswith(".")

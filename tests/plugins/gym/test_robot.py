@@ -26,6 +26,9 @@ SPACES: Final[dict[str, gymnasium.Space[Any]]] = {
 PIXELS: Final = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
 
 
+MADE = "cannot be made (a package first: env=PACKAGE:ID; no render_mode: picture=none)"
+
+
 class Fake(gymnasium.Env[Any, Any]):
     """An environment that does what its keywords say, and keeps what it is given."""
 
@@ -243,7 +246,7 @@ def test_the_period_is_the_environment_s_and_said_of_which_name(facts: dict[str,
     made = kind(written(**facts), TaskKind)
     assert made.period_ns == period_ns
     assert made.open_actions(0, period_ns).describe()["period"] == of
-    assert made.open_actions(0, 1_000_000).describe()["period"] == "1 ms, of control_hz"
+    assert made.open_actions(0, 1_000_000).describe()["period"] == f"1 ms, of control_hz, not {of}"
 
 
 def test_an_environment_without_a_period_asks_for_the_rate() -> None:
@@ -334,19 +337,23 @@ def make(**parameters: object) -> Callable[[], object]:
         (
             make(raises="make"),
             UsageError,
-            r"Fake-v0 cannot be made (of a package: env=PACKAGE:ID): ValueError: no make\n",
+            rf"Fake-v0 {MADE}: ValueError: no make\n",
         ),
         (make(raises="reset"), RobotError, r"Fake-v0 cannot be reset: ValueError: no reset\ntoday"),
         (lambda: sent(robot(raises="step"), None), RobotError, r"Fake-v0 raised: ValueError: no step\ntoday"),
         (lambda: sent(robot(), [1, 2, 3]), RobotError, "an action of shape (3,); Fake-v0 takes (2,)"),
-        (make(env="NoSuch-v0"), UsageError, "NoSuch-v0 cannot be made (of a package: env=PACKAGE:ID): NameNotFound"),
-        (make(env="no_such_package:A-v0"), UsageError, "no_such_package:A-v0 cannot be made (of a package: env="),
+        (
+            make(env="NoSuch-v0"),
+            UsageError,
+            f"NoSuch-v0 {MADE}: NameNotFound",
+        ),
+        (make(env="no_such_package:A-v0"), UsageError, f"no_such_package:A-v0 {MADE}"),
         (make(space="dict"), UsageError, "Fake-v0 takes actions of Dict("),
         (lambda: kind("gym", TaskKind), UsageError, "env: name an environment, as in env=CartPole-v1"),
         (make(env=""), UsageError, "env: name an environment, as in env=CartPole-v1"),
         (make(position="state[a:b]"), UsageError, "position = 'state[a:b]' should look like state[0:3]"),
-        (make(success="return"), UsageError, "least is the sum of rewards that success=return needs"),
-        (make(least=3), UsageError, "least is the sum of rewards that success=return needs"),
+        (make(success="return"), UsageError, "success=return needs least=SUM of rewards, no other does"),
+        (make(least=3), UsageError, "success=return needs least=SUM of rewards, no other does"),
         (make(success="luck"), UsageError, "success = 'luck': input should be 'info', 'terminated', 'survival' or"),
     ],
 )

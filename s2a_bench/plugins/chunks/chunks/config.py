@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator
 
-from s2a_bench.act import ROBOTS, ActionKind, kind
+from s2a_bench.act import ROBOTS, ActionKind, TaskKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
@@ -171,7 +171,7 @@ class ChunksLive(ChunksOptions, ServedOptions):
     seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
     robot: str = option(
         "",
-        "what takes the actions: ros?topic=/NAME, call?function=MODULE:NAME, gym?env=ID [default: none]",
+        "what takes the actions: ros?topic=/NAME, call?function=MODULE:NAME [default: none]",
         first=True,
         names=lambda: ROBOTS,
     )
@@ -182,7 +182,8 @@ class ChunksLive(ChunksOptions, ServedOptions):
 
     def check(self) -> None:
         super().check()
-        _ = self.robot_kind  # raises UsageError
+        if isinstance(self.robot_kind, TaskKind):
+            raise UsageError(f"`robot`: {self.robot.partition('?')[0]} does a task: run 's2a-bench task'")
         if self.seconds * 1e9 < 2 * self.setting.period_ns:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"

@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 from s2a_bench.act import ROBOTS, TaskKind, kind
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import AROUND, GROUPED
-from s2a_bench.inference import EngineConfig, acting, check_engine
+from s2a_bench.harness.config import AROUND, DEFAULT_TASK, GROUPED
+from s2a_bench.inference import EngineConfig, check_engine
 from s2a_bench.options import Names, group, option
 from s2a_bench.plugins.chunks.chunks.config import Sources
 from s2a_bench.plugins.chunks.latencies import Source, sources
-from s2a_bench.plugins.chunks.modes import ControlSetting, mode
+from s2a_bench.plugins.chunks.modes import ControlSetting, Rounding, mode
 from s2a_bench.plugins.chunks.options import ControlOptions, LoopRequests, ServedOptions, acting_modes
 
 MOST_STEPS = 1_000_000
@@ -30,6 +30,7 @@ class TaskOptions(ControlOptions):
     control_hz: float | None = option(  # type: ignore[assignment] # None: asked when it runs
         None, "control ticks a second [default: those of the robot's world]", ge=1e-3, le=10_000, allow_inf_nan=False
     )
+    rounding: Rounding = option("ceil", "ceil: an action counts from its arrival on; floor: for the whole tick of it")
     episodes: int = option(50, "episodes of each row; all rows have the same seeds", ge=1, le=100_000, first=True)
     steps: int = option(MOST_STEPS, "control ticks after which an episode ends, if it has not", ge=1, le=MOST_STEPS)
     margin: float = option(0.1, "share of successes that a latency may cost, to be borne", gt=0, lt=1)
@@ -64,7 +65,7 @@ class TaskVirtual(TaskOptions):
     virtual: ClassVar[bool] = True
 
     engine: EngineConfig = group(EngineConfig, only=("name", "action_dim"))
-    prompt: str = option("", "what the policy is told")
+    prompt: str = option(DEFAULT_TASK, "the task in words")
     latency: Sources = option(
         ("0", "50", "100", "200"),
         "observation to usable chunk: ms, FAMILY:mean_ms=...,key=value, FILE.csv, a run folder, or a profile; several "
@@ -89,7 +90,7 @@ class TaskVirtual(TaskOptions):
         if not self.latency:
             raise UsageError("`latency`: name at least one")
         if "name" not in self.engine.model_fields_set:
-            raise UsageError(f"`engine`: name the policy, as call?function=MODULE:NAME; {acting()} have actions")
+            raise UsageError("`engine`: name the policy, as call?function=MODULE:NAME")
         check_engine(self.policy)
         _ = self.sources  # raises UsageError
 

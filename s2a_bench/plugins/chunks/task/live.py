@@ -9,6 +9,7 @@ from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING
 
+from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
@@ -39,6 +40,8 @@ def _drive(config: TaskLive, control: ControlPlan, launch: RunningLaunch) -> Non
     slower: list[float] = []
     with closing(config.robot_kind.open_actions(0, setting.period_ns)) as robot:
         launch.writer.update(robot=robot.describe())
+        if robot.picture() is not None and launch.plan.feed.cameras > 1:
+            raise UsageError("`cameras`: the robot's world has one picture")
         launch.progress.stage("warming up")
         for sessions in cells.values():
             warm_up(setting, launch, sessions, blocks, robot)
@@ -59,4 +62,6 @@ def _drive(config: TaskLive, control: ControlPlan, launch: RunningLaunch) -> Non
                 launch.progress.advance()
     if (factor := max(slower, default=0.0)) > 1:
         about = f"a tick took up to {factor:.1f} control periods: the world was slower than the wall clock"
-        launch.warnings.append(RunWarning("slow-world", about, "lower `control_hz`, or leave out its pictures"))
+        launch.warnings.append(
+            RunWarning("slow-world", about, "leave out its pictures, or act in virtual time, which waits")
+        )

@@ -30,9 +30,11 @@ class EpisodeRow:
     latency_s: Annotated[NonNegative | None, mean("L", "Mean latency of its requests.", "s", "neither")]
     success: Annotated[bool, Metric("success", "Whether the task was done.", better="higher", statistic="mean")]
     reward: Annotated[float, mean("return", "Sum of the rewards.", better="higher", bounds=ANY)]
-    duration_s: Annotated[NonNegative, mean("time", "Until its end, or its success, in its world's time.", "s")]
+    duration_s: Annotated[
+        NonNegative, mean("time", "Until its end, or its success, at the control period.", "s", "neither")
+    ]
     ticks: Annotated[int, mean("ticks", "Control ticks.", "ticks", "neither")]
-    stall_ticks: Annotated[int, mean("stalled", "Ticks without an action, after the first one.", "ticks")]
+    stall_ticks: Annotated[int, mean("stalled", "Ticks without an action, after the first one.", "ticks", "neither")]
     age_ticks: Annotated[NonNegative | None, mean("age", "Age of the observation behind an action.", "ticks")]
     path: Annotated[NonNegative, mean("path", "Length of the path of the actions, or of the position.")]
     jerk: Annotated[NonNegative, mean("jerk", "Its third difference from tick to tick, root mean square.", "1/s^3")]
@@ -42,7 +44,7 @@ class EpisodeRow:
 
 
 EPISODES: Final[Table[EpisodeRow]] = Table("episodes", EpisodeRow)
-COMPARED: Final = Comparable.of(EPISODES, ("p_success", "reward", "duration_s", "stall_ticks"), ("mode", "latency"))
+COMPARED: Final = Comparable.of(EPISODES, ("p_success", "reward"), ("mode", "latency"))
 
 
 def episode_row(
@@ -93,7 +95,7 @@ class TaskCell:
     success_low: Annotated[Fraction, about("Its two-sided 95 % interval (Clopper and Pearson), the lower end.")]
     success_high: Fraction
     reward: float
-    duration_s: NonNegative
+    duration_s: Annotated[NonNegative | None, about("Mean time to a success.")]
     stall_ticks: NonNegative
     age_ticks: NonNegative | None
     path: NonNegative
@@ -126,6 +128,8 @@ def _cell(name: str, episodes: Cells[EpisodeRow], ends: Mapping[str, Mapping[int
     count, done = len(episodes), int(sum(ends[name].values()))
     means = ("latency_s", "reward", "duration_s", "stall_ticks", "age_ticks", "path", "jerk", "slower")
     values: dict[str, Any] = {metric: episodes.mean(metric) for metric in means}
+    values["duration_s"] = episodes.where(success=True).mean("duration_s")
+    without = "" if name == without else without
     pairs = [(ends[without].get(seed), here) for seed, here in ends[name].items()] if without else []
     return TaskCell(
         cell=name,

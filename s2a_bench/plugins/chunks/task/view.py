@@ -12,6 +12,7 @@ import numpy as np
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import Cells, metrics_of
 from s2a_bench.plugins.chunks.chunks.view.figures import LINE_COLOURS
+from s2a_bench.plugins.chunks.chunks.view.tables import CONVENTION
 from s2a_bench.plugins.chunks.task.rows import EPISODES, EpisodeRow, TaskCell, task_cells
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.json import frame
@@ -32,7 +33,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: list(task_sentences(cells, settings["margin"])),
         tables={
-            "task": lambda: task_table(cells, run.manifest.get("robot", {}), settings["margin"]),
+            "task": lambda: task_table(cells, run.manifest.get("robot", {}), settings["margin"], settings["rounding"]),
             "motion": lambda: motion_table(cells),
         },
         main=["task"],
@@ -55,11 +56,13 @@ def task_sentences(cells: Sequence[TaskCell], margin: float) -> Iterator[str]:
         if without and without.success_low <= margin:
             yield f"{mode}: no latency is judged, as {share(without)} succeed without any."
         elif judged:
-            yield f"{mode} {borne(judged, margin)}."
+            yield f"{mode}: {borne(judged, margin)}."
         elif any(cell.fixed_s for cell in group):
             yield f"{mode}: no latency is judged without --latency 0."
         for cell in group:
-            if cell.fixed_s is None:
+            if (cell.slower or 0) > 1:
+                yield f"{mode} at {cell.source} is not judged: the world was slower than the wall clock."
+            elif cell.fixed_s is None:
                 yield f"{mode} at {cell.source}, {_ms(cell.latency_s)} ms: {share(cell)} of {cell.episodes} succeed."
 
 
@@ -68,26 +71,29 @@ def borne(judged: Sequence[TaskCell], margin: float) -> str:
     within = 0
     while within < len(judged) and (judged[within].lost_high or 0) <= margin:
         within += 1
-    best = f"bears {judged[within - 1].latency} ms" if within else "bears none of the latencies"
-    text = f"{best}: within {margin:.0%} of the success without latency, at 95 %"
+    best = (
+        f"bears {judged[within - 1].latency} ms: within {margin:.0%} of the success without latency, at 95 %; "
+        * bool(within)
+    )
     if within == len(judged):
-        return f"{text}; nothing longer was tried"
+        return f"{best}nothing longer was tried"
     beyond = judged[within]
-    broken = beyond.lost_low is not None and beyond.lost_low > margin
-    verdict = "it is lost" if broken else f"{beyond.episodes} episodes leave it undecided"
-    return f"{text}; at {beyond.latency} ms {verdict}: {share(beyond)} succeed"
+    if beyond.lost_low is not None and beyond.lost_low > margin:
+        return f"{best}more is lost at {beyond.latency} ms: {share(beyond)} succeed"
+    return f"{best}{beyond.episodes} episodes leave it undecided at {beyond.latency} ms: {share(beyond)} succeed"
 
 
 def share(cell: TaskCell) -> str:
     return f"{cell.success:.0%} [{cell.success_low * 100:.0f}, {cell.success_high * 100:.0f}]"
 
 
-def task_table(cells: Sequence[TaskCell], robot: dict[str, str], margin: float) -> TextTable:
+def task_table(cells: Sequence[TaskCell], robot: dict[str, str], margin: float, rounding: str) -> TextTable:
     lost = "lost: successes on the same seeds without latency that are missing here, with bounds of 95 % on each side"
     notes = (
-        f"Robot: {', '.join(f'{name} {value}' for name, value in robot.items())}.",
+        f"Robot: {', '.join(f'{name} {value}' for name, value in robot.items() if value)}.",
+        CONVENTION[rounding],
         f"95 %: the interval of Clopper and Pearson; {lost}; margin: {margin:.0%}.",
-        "time: to the end of an episode or to its success.",
+        "time: to a success.",
     )
     header = ("mode", "latency", "L (ms)", "n", "success, %", "95 %", "lost, %", "time (s)")
     return _table("What delay costs the task", header, cells, _entries, notes)
@@ -104,7 +110,7 @@ def _entries(cell: TaskCell) -> tuple[str, ...]:
         f"{cell.success * 100:.0f}",
         interval,
         lost,
-        number(cell.duration_s),
+        ABSENT if cell.duration_s is None else number(cell.duration_s),
     )
 
 

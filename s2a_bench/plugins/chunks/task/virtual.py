@@ -6,17 +6,19 @@ import os
 import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from s2a_bench.clock import VirtualClock
+from s2a_bench.errors import RobotError
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import end_with_parent, limit_threads
@@ -110,14 +112,19 @@ def _bare(source: Source) -> Source:
 def _everywhere(jobs: Sequence[tuple[TaskCase, int]]) -> Iterator[EpisodeRow]:
     """Yield the episodes in their order, done on all cores of this process."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
-    if cores == 1:
+    if cores == 1 or parent_process():  # of a sweep, which uses them all
         yield from map(_episode, jobs)
         return
-    with ProcessPoolExecutor(cores, get_context("spawn"), initializer=_prepare) as pool:
-        try:
-            yield from pool.map(_episode, jobs, chunksize=max(1, min(16, len(jobs) // (8 * cores))))
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    others = set(active_children())
+    pool = ProcessPoolExecutor(cores, get_context("spawn"), initializer=_prepare)
+    try:
+        yield from pool.map(_episode, jobs)
+    except BrokenProcessPool as error:
+        raise RobotError("`robot`: a process ended in the middle of an episode (out of memory?)") from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(active_children()) - others:
+            child.terminate()
 
 
 def _prepare() -> None:

@@ -15,7 +15,7 @@ from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
-_CONVENTION: Final = {
+CONVENTION: Final = {
     "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
 }
@@ -81,7 +81,7 @@ class ChunkCells:
 
     @property
     def convention(self) -> str:
-        return _CONVENTION[self.settings["rounding"]]
+        return CONVENTION[self.settings["rounding"]]
 
 
 def chunk_tables(cells: ChunkCells) -> Tables:
