@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = "s2a_bench"
 BESIDE = ("studies", "tools", "benchmarks", "tests")
-BUDGETS = {"s2a_bench": 55_110, "core": 40_520, "tests": 47_610}
+BUDGETS = {"s2a_bench": 55_930, "core": 40_680, "tests": 48_630}
 """Lines: of the product, of its core, and of the tests."""
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

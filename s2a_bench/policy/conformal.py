@@ -301,13 +301,15 @@ def _least(stalls: NDArray[np.bool_]) -> list[float]:
 
 
 def upper_bound(stalled: float, plans: float, confidence: float) -> float:
-    """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934).
-
-    The upper end of their two-sided 95 % interval is the bound with confidence 0.975.
-    """
+    """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934)."""
     from scipy import stats
 
     return 1.0 if stalled == plans else float(stats.beta.ppf(confidence, stalled + 1, plans - stalled))
+
+
+def interval(seen: float, of: float) -> tuple[float, float]:
+    """Return the two-sided 95 % interval of a share, by `upper_bound`."""
+    return 1 - upper_bound(of - seen, of, 0.975), upper_bound(seen, of, 0.975)
 
 
 def stalled(schedule: Schedule) -> NDArray[np.bool_]:

@@ -12,9 +12,9 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.machine import environment
 from s2a_bench.options import Names, Options, option
 from s2a_bench.plugins.chunks.task.config import TaskVirtual
-from s2a_bench.plugins.chunks.task.rows import EPISODES, SIDE
+from s2a_bench.plugins.chunks.task.rows import EPISODES
 from s2a_bench.plugins.chunks.task.virtual import run_virtual
-from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.policy.conformal import interval
 from s2a_bench.progress import NullProgress
 from s2a_bench.provenance import NONE, Origins, Provenance
 from s2a_bench.store.run import RunWriter, read_run
@@ -119,8 +119,8 @@ def _rows(task: str, run: StoredRun) -> Iterator[TaskStudyRow]:
             episodes=count,
             successes=done,
             success=done / count,
-            success_low=1 - upper_bound(count - done, count, SIDE),
-            success_high=upper_bound(done, count, SIDE),
+            success_low=interval(done, count)[0],
+            success_high=interval(done, count)[1],
             duration_s=float(means["duration_s"]),
             stall_ticks=float(means["stall_ticks"]),
             age_ticks=None if part["age_ticks"].isna().all() else float(means["age_ticks"]),

@@ -26,7 +26,7 @@ from s2a_bench.plugins.chunks.chunks.rows import (
 )
 from s2a_bench.plugins.chunks.modes.closed import beta, closed
 from s2a_bench.plugins.chunks.modes.metrics import greatest, margin_ticks, mean, measure, p99, reaction_ticks
-from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.policy.conformal import interval
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
@@ -45,8 +45,6 @@ REQUESTS_TRIED: Final = 2000
 """At each mean."""
 SHARES: Final = np.linspace(0, 1, 401)
 """Quantiles of reaction times that are stored: denser than a figure can show."""
-_SIDE: Final = 0.975
-"""Confidence of each end of a two-sided 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,8 +138,7 @@ def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
     counts: dict[str, Any] = {"boundaries": boundaries, "stalled_cycles": stalled}
     if boundaries:
         counts["p_stall_cycle"] = stalled / boundaries
-        counts["p_stall_low"] = 1 - upper_bound(boundaries - stalled, boundaries, _SIDE)
-        counts["p_stall_high"] = upper_bound(stalled, boundaries, _SIDE)
+        counts["p_stall_low"], counts["p_stall_high"] = interval(stalled, boundaries)
     return counts
 
 

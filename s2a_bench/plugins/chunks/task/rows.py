@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.bounds import Count, Fraction, Many, NonNegative, about
 from s2a_bench.experiments.cells import ANY, Cells, Comparable, Metric, mean
-from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.policy.conformal import interval
 from s2a_bench.store.schema import Table
 
 if TYPE_CHECKING:
     from s2a_bench.act import Outcome
     from s2a_bench.plugins.chunks.control import Acted
-
-SIDE: Final = 0.975
-"""Confidence of each end of a two-sided 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,8 +135,8 @@ def _cell(name: str, episodes: Cells[EpisodeRow], ends: Mapping[str, Mapping[int
         episodes=count,
         successes=done,
         success=done / count,
-        success_low=1 - upper_bound(count - done, count, SIDE),
-        success_high=upper_bound(done, count, SIDE),
+        success_low=interval(done, count)[0],
+        success_high=interval(done, count)[1],
         **values,
         **(_lost([pair for pair in pairs if pair[0] is not None]) if without else {}),
     )
@@ -153,12 +150,5 @@ def _lost(pairs: list[tuple[bool | None, bool]]) -> dict[str, float]:
     """
     count = len(pairs)
     lost, won = (sum(pair == kind for pair in pairs) for kind in ((True, False), (False, True)))
-
-    def least(seen: int) -> float:
-        return 1 - upper_bound(count - seen, count, SIDE)
-
-    return {
-        "lost": (lost - won) / count,
-        "lost_low": least(lost) - upper_bound(won, count, SIDE),
-        "lost_high": upper_bound(lost, count, SIDE) - least(won),
-    }
+    (lost_low, lost_high), (won_low, won_high) = interval(lost, count), interval(won, count)
+    return {"lost": (lost - won) / count, "lost_low": lost_low - won_high, "lost_high": lost_high - won_low}

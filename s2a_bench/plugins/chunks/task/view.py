@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from s2a_bench.experiments import Shown
-from s2a_bench.experiments.cells import Cells, metrics_of
+from s2a_bench.experiments.cells import Cells, json_of, metrics_of
 from s2a_bench.plugins.chunks.chunks.view.figures import LINE_COLOURS
 from s2a_bench.plugins.chunks.chunks.view.tables import CONVENTION
 from s2a_bench.plugins.chunks.task.rows import EPISODES, EpisodeRow, TaskCell, task_cells
@@ -39,12 +38,8 @@ def show(run: StoredRun, **_: Any) -> Shown:
         main=["task"],
         csvs=lambda: {"episodes.csv": episodes.csv()},
         figures=lambda: {"task": lambda: build_task(cells, settings)} if cells else {},
-        json=lambda: frame(run, [_json(cell) for cell in cells], []),
+        json=lambda: frame(run, [json_of(cell) for cell in cells], []),
     )
-
-
-def _json(cell: TaskCell) -> dict[str, Any]:
-    return {name: value for name, value in asdict(cell).items() if value is not None}
 
 
 def task_sentences(cells: Sequence[TaskCell], margin: float) -> Iterator[str]:

@@ -80,9 +80,10 @@ def run_virtual(config: TaskVirtual, output: Path, progress: Progress) -> Path:
         origin = Provenance.of_engine(engine.describe(), link=NONE)
     with closing(robot.open_actions(0, setting.period_ns)) as world:
         facts = world.describe()
+    bare = [replace(source, requests=(), service_ns=None) for source in config.sources]  # sent with every job
     cases = [
         TaskCase(robot, config.policy, config.prompt, name, mode, setting, source, config.steps, config.seed)
-        for source, (name, mode) in product(map(_bare, config.sources), control.modes.items())
+        for source, (name, mode) in product(bare, control.modes.items())
     ]
     cells = {case.cell: replace(origin, tokens="emulated", clock="virtual", profile=case.source.name) for case in cases}
     manifest = {
@@ -102,11 +103,6 @@ def run_virtual(config: TaskVirtual, output: Path, progress: Progress) -> Path:
             writer.append(EPISODES, [row])
             progress.advance()
         return writer.path
-
-
-def _bare(source: Source) -> Source:
-    """Return a source without what only other commands read of a recording: it is sent with every job."""
-    return replace(source, requests=(), service_ns=None)
 
 
 def _everywhere(jobs: Sequence[tuple[TaskCase, int]]) -> Iterator[EpisodeRow]:

@@ -207,7 +207,7 @@ def test_a_mode_bears_the_latencies_before_the_first_that_may_cost_more_than_the
 def test_only_latencies_of_one_number_are_judged_and_only_against_none() -> None:
     drawn = cell("normal:mean_ms=50,cv=1", 0.5, 0.6)
     assert list(task_sentences([cell("0"), cell("100"), drawn], 0.2)) == [
-        "sync bears 100 ms: within 20% of the success without latency, at 95 %; nothing longer was tried.",
+        "sync: bears 100 ms: within 20% of the success without latency, at 95 %; nothing longer was tried.",
         "sync at normal:mean_ms=50,cv=1, 50.0 ms: 80% [66, 90] of 50 succeed.",
     ]
     alone = cell("100", None, None)
