@@ -104,7 +104,7 @@ def test_what_it_says_is_what_its_rows_hold(run: StoredRun) -> None:
     assert [(cell.mode, cell.latency) for cell in cells] == list(product(SHARED["modes"], SHARED["latency"]))
     assert [cell.successes for cell in cells] == [40, 40, 0] * 2
     within = "within 10% of the success without latency, at 95 %; more is lost at 300 ms: 0% [0, 9] succeed."
-    assert list(show(run).sentences) == [f"{name} bears 20 ms: {within}" for name in SHARED["modes"]]
+    assert list(show(run).sentences) == [f"{name}: bears 20 ms: {within}" for name in SHARED["modes"]]
 
 
 @pytest.mark.parametrize(
