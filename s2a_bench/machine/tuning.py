@@ -97,6 +97,12 @@ def end_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
     _libc.prctl(PR_SET_PDEATHSIG, number)
 
 
+def obey_parent() -> None:
+    """Prepare a worker process: Ctrl-C is its parent's to handle, which it does not outlive."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+
+
 def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
     """Start a program that the kernel kills, stopped or not, when this process ends; options are those of `Popen`.
 

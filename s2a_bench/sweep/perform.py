@@ -22,7 +22,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError, StoreError, UsageError, how_it_ended
 from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.environment import collect
-from s2a_bench.machine.tuning import end_with_parent
+from s2a_bench.machine.tuning import end_with_parent, obey_parent
 from s2a_bench.store import manifest as manifests
 from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.plan import SweepPlan
@@ -117,7 +117,7 @@ class LocalWorkers(CellWorkers):
     def _pool(self, virtual: bool) -> ProcessPoolExecutor:
         if virtual not in self._pools:
             self._pools[virtual] = ProcessPoolExecutor(
-                self.width if virtual else 1, mp_context=get_context("spawn"), initializer=prepare
+                self.width if virtual else 1, mp_context=get_context("spawn"), initializer=obey_parent
             )
         return self._pools[virtual]
 
@@ -128,12 +128,6 @@ class LocalWorkers(CellWorkers):
             for child in set(active_children()) - self._others:
                 child.terminate()  # a measured cell's process sees it, and closes its run folder
                 child.join()
-
-
-def prepare() -> None:
-    """Prepare a worker: the sweep handles Ctrl-C, and no worker outlives it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
 
 
 class RayWorkers(CellWorkers):

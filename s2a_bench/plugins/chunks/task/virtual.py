@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -21,9 +20,10 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import RobotError
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.machine import environment
-from s2a_bench.machine.tuning import end_with_parent, limit_threads
+from s2a_bench.machine.tuning import limit_threads, obey_parent
 from s2a_bench.plugins.chunks.acting import frame_of
 from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks
+from s2a_bench.plugins.chunks.modes.cycles import arrivals
 from s2a_bench.plugins.chunks.requester import SEEDS, check_length
 from s2a_bench.plugins.chunks.task.rows import EPISODES, EpisodeRow, episode_row
 from s2a_bench.provenance import NONE, Origins, Provenance
@@ -124,9 +124,7 @@ def _everywhere(jobs: Sequence[tuple[TaskCase, int]]) -> Iterator[EpisodeRow]:
 
 
 def _prepare() -> None:
-    """Prepare a process: Ctrl-C is its parent's, which it does not outlive."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    obey_parent()
     limit_threads()
 
 
@@ -142,26 +140,23 @@ def _episode(job: tuple[TaskCase, int]) -> EpisodeRow:
     robot.begin(seed)
     clock, latencies_ns = VirtualClock(), case.latencies_ns(seed)
 
-    def ask(request: int, tick: int) -> None:
+    def request_chunk(number: int, tick: int) -> None:
         picture = robot.picture()
         images = () if picture is None else (frame_of(picture, tick, clock.now_ns()),)
-        name, draw, state = f"{seed}-{request}", (seed + tick) % SEEDS, robot.state()
-        asked = Request(name, case.prompt, images, case.setting.horizon, seed=draw, state=state)
-        actions = [piece.values for piece in engine.generate(asked) if isinstance(piece, Action)]
+        name, draw, state = f"{seed}-{number}", (seed + tick) % SEEDS, robot.state()
+        request = Request(name, case.prompt, images, case.setting.horizon, seed=draw, state=state)
+        actions = [piece.values for piece in engine.generate(request) if isinstance(piece, Action)]
         check_length(f"`engine` {case.engine.name}", len(actions), case.setting.horizon)
-        at_ns = clock.now_ns() + next(latencies_ns)
-        if not (gap_ns := case.mode.gap_ns):
-            acting.arrived(request, actions, at_ns)
-            return
-        for index in range(len(actions)):
-            acting.arrived(request, actions[: index + 1], at_ns + index * gap_ns)
+        (after_ns,) = arrivals(case.mode, np.array([next(latencies_ns)]), case.setting).tolist()
+        for at_ns, arrived in {at_ns: arrived for arrived, at_ns in enumerate(after_ns, 1)}.items():
+            acting.arrived(number, actions[:arrived], clock.now_ns() + at_ns)
 
     def send(action: Vector | None, at_ns: int) -> None:
         robot.send(action, at_ns)
         if robot.over:
             acting.finish()
 
-    acting = RobotTicks(case.mode, case.setting, send, ask, case.steps)
+    acting = RobotTicks(case.mode, case.setting, send, request_chunk, case.steps)
     ControlLoop([acting], clock).run()
     names = {"cell": case.cell, "mode": case.name, "latency": case.source.name}
     return episode_row(names, seed, acting.acted(), case.setting.period_ns, robot.outcome(), live=False)
