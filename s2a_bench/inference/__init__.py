@@ -215,6 +215,8 @@ class EngineConfig(Options):
         build(self.kind.parameters, self.name, "engine")
         if self.chunks and not self.kind.acts:
             raise UsageError(f"`answer`: `engine` {self.name} answers with tokens alone; use `engine` {acting()}")
+        if self.answer == "tokens" and not self.kind.speaks:
+            raise UsageError(f"`answer` tokens: `engine` {self.name.partition('?')[0]} answers with actions alone")
         if self.of_model and not self.kind.needs_model:
             raise UsageError(f"`{self.of_model}` is for an engine with a model; leave it out with `engine` {self.name}")
 
@@ -246,7 +248,7 @@ class EngineConfig(Options):
     @property
     def wanted(self) -> str:
         """Return `answer`; where the engine leaves no choice, what it answers with."""
-        return self.answer if self.kind.speaks or self.answer == "tokens" else "actions"
+        return self.answer if self.kind.speaks else "actions"
 
     @property
     def chunks(self) -> bool:

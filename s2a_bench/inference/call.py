@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 
-from s2a_bench.errors import EngineError, RequestFailed, UsageError
+from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.policy.parameters import build
 from s2a_bench.registry import check_function, function_of
@@ -38,11 +38,6 @@ class CallEngine(Engine):
     needs_model = False
     parameters = Called
     risk = "program"
-
-    @classmethod
-    def check(cls, config: EngineConfig) -> None:
-        if config.answer == "tokens":
-            raise UsageError("`answer` tokens: `engine` call answers with actions alone")
 
     def __init__(self, config: EngineConfig) -> None:
         self._name = build(Called, config.name, "engine").function
