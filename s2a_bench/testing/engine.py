@@ -23,7 +23,7 @@ def ask(
     return list(engine.generate(Request("r", prompt, images, **{"max_tokens": 6, **rest})))  # type: ignore[arg-type]
 
 
-def said(engine: Engine, prompt: str = "stop at the red line", **rest: object) -> list[str]:
+def texts(engine: Engine, prompt: str = "stop at the red line", **rest: object) -> list[str]:
     return [piece.text for piece in ask(engine, prompt, **rest)]  # type: ignore[arg-type]
 
 
@@ -46,22 +46,22 @@ class EngineSuite:
         assert ask(engine, "")
 
     def test_closing_early_leaves_the_next_answer_whole(self, engine: Engine) -> None:
-        whole = said(engine, seed=3)
+        whole = texts(engine, seed=3)
         tokens = engine.generate(Request("early", "stop at the red line", max_tokens=6))
         next(tokens)
         tokens.close()  # type: ignore[attr-defined]
-        assert said(engine, seed=3) == whole
+        assert texts(engine, seed=3) == whole
 
     def test_an_answer_never_asked_for_leaves_the_next_whole(self, engine: Engine) -> None:
-        whole = said(engine, seed=3)
+        whole = texts(engine, seed=3)
         engine.generate(Request("unused", "go", max_tokens=6))
-        assert said(engine, seed=3) == whole
+        assert texts(engine, seed=3) == whole
 
     def test_the_same_seed_gives_the_same_answer_with_other_requests_between(self, engine: Engine) -> None:
-        first = said(engine, seed=7, images=(rgb_frame(1),))
+        first = texts(engine, seed=7, images=(rgb_frame(1),))
         ask(engine, "turn left", seed=8)
         ask(engine, seed=7, images=(rgb_frame(2),))
-        assert said(engine, seed=7, images=(rgb_frame(1),)) == first
+        assert texts(engine, seed=7, images=(rgb_frame(1),)) == first
 
     def test_a_prompt_may_carry_none_one_or_two_pictures(self, engine: Engine) -> None:
         for count in (0, 1, 2, 0):

@@ -111,6 +111,7 @@ def run_task(config: TaskStudyConfig, folder: Path, progress: Progress) -> Path:
 def _rows(task: str, run: StoredRun) -> Iterator[TaskStudyRow]:
     for (mode, latency), part in run.table(EPISODES).groupby(["mode", "latency"], sort=False):
         count, done = len(part), int(part["success"].sum())
+        low, high = interval(done, count)
         means = part[["duration_s", "stall_ticks", "age_ticks"]].mean()
         yield TaskStudyRow(
             task=task,
@@ -119,8 +120,8 @@ def _rows(task: str, run: StoredRun) -> Iterator[TaskStudyRow]:
             episodes=count,
             successes=done,
             success=done / count,
-            success_low=interval(done, count)[0],
-            success_high=interval(done, count)[1],
+            success_low=low,
+            success_high=high,
             duration_s=float(means["duration_s"]),
             stall_ticks=float(means["stall_ticks"]),
             age_ticks=None if part["age_ticks"].isna().all() else float(means["age_ticks"]),

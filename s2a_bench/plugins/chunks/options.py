@@ -65,7 +65,11 @@ class ControlOptions(Options):
     def check(self) -> None:
         if not self.modes:
             raise UsageError("`modes`: name at least one")
-        _ = self.control  # raises UsageError
+        self.check_modes()
+
+    def check_modes(self) -> None:
+        """Raise UsageError for a mode that is none, or that cannot act so."""
+        _ = self.control
 
     def to_manifest(self) -> dict[str, Any]:
         fields = self.model_dump(mode="json", exclude={"requests"})

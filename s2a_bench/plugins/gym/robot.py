@@ -60,7 +60,7 @@ class Gym(TaskKind):
 
     @property
     def period_ns(self) -> int:
-        return _period(self)[0]
+        return _period_ns(self)
 
     def open_actions(self, dims: int, period_ns: int) -> GymRobot:  # noqa: ARG002 - the environment knows
         return GymRobot(self, period_ns)
@@ -89,17 +89,26 @@ class Gym(TaskKind):
             raise kind(f"`robot`: gym: {self.env} {what}: {type(error).__name__}: {error}") from error
 
 
-@cache
-def _period(kind: Gym) -> tuple[int, str]:
-    """Return the period of an environment in ns, and where that is written."""
-    with closing(kind.made()) as env:
-        rate = env.metadata.get("render_fps")
-        known = {name: getattr(env.unwrapped, name, None) for name in ("dt", "tau")}
-        known["render_fps"] = 1 / rate if rate else None
+def _period(env: Any) -> tuple[int, str] | None:
+    """Return the period of an environment in ns, and where that is written; None: nowhere."""
+    rate = env.metadata.get("render_fps")
+    known = {name: getattr(env.unwrapped, name, None) for name in ("dt", "tau")}
+    known["render_fps"] = 1 / rate if rate else None
     for name, period_s in known.items():
         if isinstance(period_s, (int, float, np.floating)) and period_s > 0:
             return round(period_s * 1e9), name
-    raise UsageError(f"`control_hz`: {kind.env} names no period (dt, tau, render_fps); say how often it takes actions")
+    return None
+
+
+@cache
+def _period_ns(kind: Gym) -> int:
+    """Return the period that the environment of a kind names; raises S2AError."""
+    with closing(kind.made()) as env:
+        found = _period(env)
+    if found is None:
+        names = "no period (dt, tau, render_fps)"
+        raise UsageError(f"`control_hz`: {kind.env} names {names}; say how often it takes actions")
+    return found[0]
 
 
 class GymRobot(TaskRobot):
@@ -131,7 +140,7 @@ class GymRobot(TaskRobot):
             self._seen, info = self._env.reset(seed=seed)
         self._seed, self.over = seed, False
         self._action = np.zeros(self._dims)
-        self._reward, self._terminated, self._truncated, self._said = 0.0, False, False, _said(info)
+        self._reward, self._terminated, self._truncated, self._done = 0.0, False, False, _done(info)
         self._path: list[NDArray[np.float64]] = []
 
     def send(self, action: Vector | None, at_ns: int) -> None:  # noqa: ARG002 - a step a tick
@@ -150,10 +159,10 @@ class GymRobot(TaskRobot):
         with self._kind.called("raised"):
             self._seen, reward, self._terminated, self._truncated, info = self._env.step(given)
         self._reward += float(reward)
-        said = _said(info)
-        self._said = said if self._said is None else self._said or bool(said)
+        if (done := _done(info)) is not None:
+            self._done = bool(self._done) or done
         self._path.append(np.array(self.state()[self._place]) if self._kind.position else taken)
-        self.over = bool(self._terminated or self._truncated or (self._kind.success == "info" and self._said))
+        self.over = bool(self._terminated or self._truncated or (self._kind.success == "info" and self._done))
 
     def state(self) -> tuple[float, ...]:
         key = self._kind.state
@@ -178,13 +187,13 @@ class GymRobot(TaskRobot):
 
     def outcome(self) -> Outcome:
         kind = self._kind
-        if kind.success == "info" and self._said is None:
+        if kind.success == "info" and self._done is None:
             raise RobotError(
                 f"`robot`: gym: {kind.env} says nothing of success (info has none of {', '.join(SUCCESS)}); add "
                 "success=survival, success=terminated, or success=return&least=SUM"
             )
         success = {
-            "info": bool(self._said),
+            "info": bool(self._done),
             "terminated": self._terminated,
             "survival": not self._terminated,
             "return": kind.least is not None and self._reward >= kind.least,
@@ -197,11 +206,12 @@ class GymRobot(TaskRobot):
     def describe(self) -> dict[str, str]:
         kind = self._kind
         keywords = "&".join(f"{name}={text}" for name, text in kind.keywords)
-        period = f"{self._period_s * 1e3:g} ms, of control_hz"
-        with suppress(UsageError):  # it names none
-            own_ns, name = _period(kind)
-            same = own_ns == round(self._period_s * 1e9)
-            period = f"{own_ns / 1e6:g} ms, of {name}" if same else f"{period}, not {own_ns / 1e6:g} ms, of {name}"
+        own_ns, name = _period(self._env) or (0, "")
+        if own_ns == round(self._period_s * 1e9):
+            period = f"{own_ns / 1e6:g} ms, of {name}"
+        else:
+            period = f"{self._period_s * 1e3:g} ms, of control_hz"
+            period += f", not {own_ns / 1e6:g} ms, of {name}" if name else ""
         facts = {"robot": "gym", "env": kind.env, "keywords": keywords, "success": kind.success, "stall": kind.stall}
         return {**facts, "period": period}
 
@@ -219,6 +229,6 @@ class GymRobot(TaskRobot):
         return seen
 
 
-def _said(info: dict[str, Any]) -> bool | None:
+def _done(info: dict[str, Any]) -> bool | None:
     """Return whether a step's info says that the task is done; None: it says nothing."""
     return next((bool(info[key]) for key in SUCCESS if key in info), None)

@@ -45,10 +45,12 @@ class TaskOptions(ControlOptions):
         period_ns = round(1e9 / self.control_hz) if self.control_hz else self.robot_kind.period_ns
         return ControlSetting(period_ns, self.horizon, self.rounding)
 
+    def check_modes(self) -> None:
+        _ = [mode(each) for each in self.modes]  # their control period is the world's, which only a run opens
+
     def check(self) -> None:
-        if not self.modes:
-            raise UsageError("`modes`: name at least one")
-        _ = [mode(each) for each in self.modes], self.robot_kind  # raise UsageError
+        super().check()
+        _ = self.robot_kind  # raises UsageError
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
         yield from super().risks()
@@ -99,7 +101,3 @@ class TaskLive(TaskOptions, ServedOptions):
     """Modes in real time, on the answers of a server."""
 
     requests: LoopRequests = group(LoopRequests, only=(*GROUPED, *AROUND, "prompt"), first=("transports",))
-
-    def check(self) -> None:
-        super().check()
-        _ = self.robots_requests  # raises UsageError

@@ -124,6 +124,7 @@ def task_cells(episodes: Cells[EpisodeRow]) -> list[TaskCell]:
 def _cell(name: str, episodes: Cells[EpisodeRow], ends: Mapping[str, Mapping[int, bool]], without: str) -> TaskCell:
     count, done = len(episodes), int(sum(ends[name].values()))
     means = ("latency_s", "reward", "duration_s", "stall_ticks", "age_ticks", "path", "jerk", "slower")
+    low, high = interval(done, count)
     values: dict[str, Any] = {metric: episodes.mean(metric) for metric in means}
     values["duration_s"] = episodes.where(success=True).mean("duration_s")
     without = "" if name == without else without
@@ -135,8 +136,8 @@ def _cell(name: str, episodes: Cells[EpisodeRow], ends: Mapping[str, Mapping[int
         episodes=count,
         successes=done,
         success=done / count,
-        success_low=interval(done, count)[0],
-        success_high=interval(done, count)[1],
+        success_low=low,
+        success_high=high,
         **values,
         **(_lost([pair for pair in pairs if pair[0] is not None]) if without else {}),
     )
