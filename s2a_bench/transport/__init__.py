@@ -290,6 +290,8 @@ class Transport(Generic[O]):
     """``module:class``, made of a wiring, whose limits it enforces, and a handler, where `server` is not overridden."""
     needs: ClassVar[tuple[str, ...]] = ()
     """The extra of both, and its modules."""
+    reader: ClassVar[str] = ""
+    """``module:class`` that reads what passes through a tap, a `tap.Reader`; empty: by who speaks."""
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         self.check_machine()

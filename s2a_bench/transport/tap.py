@@ -1,0 +1,200 @@
+"""What passes between a client and a server of others, read from copies of the bytes that a tap passes on.
+
+A transport declares its reader (`Transport.reader`), a subclass of `Reader`: it finds where requests and answers begin
+and end. It does no I/O, keeps at most `MOST_BYTES` of one message, and may raise anything: the tap goes on without it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+MOST_BYTES: Final = 64 << 20
+"""Of a message that is decoded."""
+MOST_WAITING: Final = 1000
+"""Requests of a connection that wait for their answers."""
+MOST_KINDS: Final = 100
+"""Kinds of requests whose first one is decoded."""
+MOST_PIECES: Final = 1 << 20
+"""Of an answer, which need not end."""
+LETTERS: Final = 100
+"""Of kinds of exchanges, and of errors."""
+
+
+@dataclass(slots=True, eq=False)
+class Seen:
+    """One exchange as a tap saw it: times in ns of CLOCK_MONOTONIC, 0 for what did not happen.
+
+    ``what`` is the kind of exchange, such as ``POST /v1/chat/completions``, without what may hold a key.
+    """
+
+    what: str
+    asked_ns: int
+    """First byte of the request arrived."""
+    sent_ns: int = 0
+    """Its last byte was passed on."""
+    answered_ns: int = 0
+    """First byte of the answer arrived."""
+    ended_ns: int = 0
+    """Its last byte was passed on."""
+    up_bytes: int = 0
+    down_bytes: int = 0
+    pieces_ns: list[int] = field(default_factory=list)
+    """When each token or partial action had been passed on; empty for an answer in one piece."""
+    infer_ms: float | None = None
+    """What the server says of its inference."""
+    chunk: tuple[int, int] | None = None
+    """Actions of the answer, and numbers of each: (H, D)."""
+    observation: Any = None
+    """The decoded request, where `Reader.fresh` asked for it: numbers, texts, bytes and arrays in lists and dicts."""
+    error: str = ""
+
+
+class Reader:
+    """Pairs the requests of one connection with its answers, in order; subclasses read `up` and `down`.
+
+    A subclass calls `ask` at the first byte of a request and `asked` at its last one, then `answer` and `answered`.
+    What a server sends while no request waits, a greeting for example, is no answer.
+    """
+
+    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
+        """Call ``tell`` with each exchange; ``known`` are the kinds whose requests need not be decoded any more."""
+        self.tell = tell
+        self.pings = 0
+        self.from_ns = self.to_ns = 0
+        """When the bytes that are read arrived, and when they had been passed on."""
+        self._known = known
+        self._waiting = deque[Seen]()
+
+    def passed(self, data: bytes, from_ns: int, to_ns: int, *, up: bool) -> None:
+        """Read bytes that went up, to the server, or down."""
+        self.from_ns, self.to_ns = from_ns, to_ns
+        (self.up if up else self.down)(data)
+
+    def up(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def down(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def fresh(self, what: str) -> bool:
+        """Whether a request is the first of its kind, whose content is wanted."""
+        fresh = what not in self._known and len(self._known) < MOST_KINDS
+        if fresh:
+            self._known.add(what)
+        return fresh
+
+    def ask(self, what: str = "") -> Seen:
+        seen = Seen(what, self.from_ns)
+        self._waiting.append(seen)
+        if len(self._waiting) > MOST_WAITING:
+            raise ValueError(f"more than {MOST_WAITING} requests without an answer")
+        return seen
+
+    def asked(self, seen: Seen, size: int) -> None:
+        seen.up_bytes = size
+        if not seen.answered_ns:  # else the server did not wait for the request's end
+            seen.sent_ns = self.to_ns
+
+    def answer(self) -> Seen | None:
+        """Return the exchange whose answer these bytes belong to, None for bytes that nobody asked for."""
+        if not self._waiting:
+            return None
+        seen = self._waiting[0]
+        seen.answered_ns = seen.answered_ns or self.from_ns
+        seen.sent_ns = seen.sent_ns or self.from_ns
+        return seen
+
+    def piece(self, seen: Seen) -> None:
+        """Count these bytes as a token or a partial action."""
+        if len(seen.pieces_ns) < MOST_PIECES:
+            seen.pieces_ns.append(self.to_ns)
+
+    def answered(self, seen: Seen, size: int) -> None:
+        """End the exchange of `answer`."""
+        self._waiting.popleft()
+        seen.ended_ns, seen.down_bytes = self.to_ns, size
+        self.tell(seen)
+
+    def end(self) -> None:
+        """Tell of the requests that a connection ended without an answer to."""
+        for seen in self._waiting:
+            seen.error = seen.error or "the connection ended before the answer"
+            self.tell(seen)
+        self._waiting.clear()
+
+
+class Turns(Reader):
+    """Any protocol, by who speaks: a request begins where the client does, and its answer where the server does."""
+
+    def up(self, data: bytes) -> None:
+        if self._waiting and self._waiting[0].ended_ns:
+            self.end()
+        seen = self._waiting[0] if self._waiting else self.ask("turns")
+        self.asked(seen, seen.up_bytes + len(data))
+
+    def down(self, data: bytes) -> None:
+        if seen := self.answer():
+            seen.ended_ns = self.to_ns
+            seen.down_bytes += len(data)
+
+    def end(self) -> None:
+        if self._waiting and self._waiting[0].ended_ns:
+            self.tell(self._waiting.popleft())
+        super().end()
+
+
+class Incoming:
+    """The bytes of one direction for a parser that is a generator: ``yield from incoming.read(n)`` waits for them."""
+
+    def __init__(self, parser: Callable[[Incoming], Generator[None, None, None]]) -> None:
+        self._bytes = bytearray()
+        self._parser = parser(self)
+        next(self._parser)
+
+    def feed(self, data: bytes) -> None:
+        self._bytes += data
+        next(self._parser)
+
+    def begin(self) -> Generator[None, None, int]:
+        """Wait for a byte, and return it; it stays to be read."""
+        while not self._bytes:
+            yield
+        return self._bytes[0]
+
+    def read(self, size: int) -> Generator[None, None, bytes]:
+        if size > MOST_BYTES:
+            raise ValueError(f"a message of {size} bytes, more than {MOST_BYTES}")
+        while len(self._bytes) < size:
+            yield
+        data = bytes(memoryview(self._bytes)[:size])
+        del self._bytes[:size]
+        return data
+
+    def skip(self, size: int) -> Generator[None, None, None]:
+        """Drop bytes as they come."""
+        while size:
+            yield from self.begin()
+            size -= (here := min(size, len(self._bytes)))
+            del self._bytes[:here]
+
+
+class ParsedReader(Reader):
+    """A reader whose directions are parsed by a generator each, `messages`."""
+
+    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
+        super().__init__(tell, known)
+        self._up = Incoming(lambda incoming: self.messages(incoming, up=True))
+        self._down = Incoming(lambda incoming: self.messages(incoming, up=False))
+
+    def up(self, data: bytes) -> None:
+        self._up.feed(data)
+
+    def down(self, data: bytes) -> None:
+        self._down.feed(data)
+
+    def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
+        """Read messages without end."""
+        raise NotImplementedError
