@@ -62,6 +62,7 @@ class Http(ListeningTransport[HttpOptions]):
     }
     compared_with = BESIDE
     client_class = "s2a_bench.transport.http.client:HttpClient"
+    reader = "s2a_bench.transport.http.tap:HttpReader"
     urls = Urls(
         HttpOptions.SCHEMES,
         examine="s2a_bench.transport.http.detect:examine",
