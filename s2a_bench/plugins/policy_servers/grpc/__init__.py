@@ -43,8 +43,9 @@ class Grpc(PolicyTransport[GrpcOptions]):
         examine="s2a_bench.plugins.policy_servers.grpc.client:examine",
         unpickles="lerobot's server unpickles what any client sends (CVE-2026-25874)",
     )
-    needs = ("grpc", "grpc")
+    needs = ("grpc", "grpc", "hpack", "hyperframe")
     client_class = "s2a_bench.plugins.policy_servers.grpc.client:GrpcClient"
+    reader = "s2a_bench.plugins.policy_servers.grpc.tap:GrpcReader"
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)
     order = 24
     style = {LEROBOT: ("#01665E", "-")}

@@ -38,6 +38,7 @@ class Websocket(ListeningTransport[WebsocketOptions], PolicyTransport[WebsocketO
     needs = ("websocket", "msgpack", "websockets")
     client_class = "s2a_bench.plugins.policy_servers.websocket.client:WebsocketClient"
     server_class = "s2a_bench.plugins.policy_servers.websocket.server:WebsocketServer"
+    reader = "s2a_bench.plugins.policy_servers.websocket.tap:WebsocketReader"
     reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s", "image_maps")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20

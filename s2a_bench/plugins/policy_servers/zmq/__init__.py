@@ -45,6 +45,7 @@ class Zmq(ListeningTransport[ZmqOptions], PolicyTransport[ZmqOptions]):
     needs = ("zmq", "msgpack", "zmq")
     client_class = "s2a_bench.plugins.policy_servers.zmq.client:ZmqClient"
     server_class = "s2a_bench.plugins.policy_servers.zmq.server:ZmqServer"
+    reader = "s2a_bench.plugins.policy_servers.zmq.tap:ZmqReader"
     facts = (PAYLOAD_BYTES, RECONNECTS)
     order = 22
     style = {GR00T: ("#8C510A", "-")}
