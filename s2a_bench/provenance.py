@@ -15,6 +15,9 @@ UNKNOWN: Final = "unknown"
 NONE: Final = "none"
 NOT_SENT: Final = "not seen or sent"
 ORIGIN: Final = "Provenance: "
+AT_TAP, AT_TOPICS, RECORDED = "seen at the tap", "seen at the topics", "recorded"
+SEEN: Final = (AT_TAP, AT_TOPICS, RECORDED)
+"""Where tokens of a robot of others were seen, neither by its client nor by its server."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",
@@ -23,6 +26,7 @@ LABELS: Final = {
     ("tokens", "emulated"): "emulated",
     ("tokens", "paced"): "paced",
     ("link", "emulated"): "emulated link",
+    **{("tokens", where): where for where in SEEN},
     ("link", UNKNOWN): "link unknown",
     ("engine", UNKNOWN): "engine unknown",
 }
@@ -34,7 +38,8 @@ class Provenance:
     """The origin of one cell's numbers.
 
     ``weights`` are real, dummy, or none without a model; emulated tokens have none, or the dummy ones of their profile.
-    ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution) or paced (held back);
+    ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution), paced (held back), or
+    one of `SEEN`;
     ``link`` real (within this machine), emulated after ``link_profile``, or none; ``clock`` monotonic or virtual.
     ``profile`` names the emulated profile or latencies. ``pictures`` are "not seen" by a text model, "not seen or
     sent" where its server refuses them; else empty. A field that nothing reported is "unknown", as the link to another
@@ -123,7 +128,7 @@ class Provenance:
         """Return the text of a column: engine/weights/tokens, then an unreal link, a virtual clock, unseen pictures."""
         more = [f"{name}-{value}" for name, value in (("link", self.link), ("clock", self.clock)) if value in _UNPLAIN]
         more += [f"pictures-{self.pictures.replace(' ', '-')}"] if self.unseen else []
-        return "/".join((self.engine, self.weights, self.tokens, *more))
+        return "/".join((self.engine, self.weights, self.tokens.replace(" ", "-"), *more))
 
     @property
     def line(self) -> str:
@@ -131,7 +136,8 @@ class Provenance:
         after = f" after {self.link_profile}" if self.link_profile else ""
         link = [f"link {self.link.upper()}{after}"] if self.link in _UNPLAIN else []
         if not self.known:
-            return ", ".join(("engine UNKNOWN (the server does not report it)", *link))
+            seen = [self.tokens.upper()] if self.tokens in SEEN else []
+            return ", ".join(("engine UNKNOWN (the server does not report it)", *seen, *link))
         model = ", ".join(filter(None, (self.model, self.quantisation, _WEIGHTS.get(self.weights, ""))))
         engine = "no engine" if self.engine == NONE else self.engine + (f" ({model})" if model else "")
         tokens = f"tokens {self.tokens.upper() if self.tokens in _LOUD else self.tokens}"

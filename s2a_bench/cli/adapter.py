@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from keyword import iskeyword
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
@@ -71,7 +72,9 @@ class Flag:
 
     @property
     def key(self) -> str:
-        return self.name.replace("-", "_")
+        """Its name as a parameter of Python: ``in_`` for a keyword."""
+        key = self.name.replace("-", "_")
+        return f"{key}_" if iskeyword(key) else key
 
 
 def _flags_of_modes(experiment: Experiment) -> Iterator[Flag]:
@@ -97,7 +100,9 @@ def _picked(experiment: Experiment, given: Mapping[str, Any]) -> type[Options]:
     picking = {flag for mode in modes for flag in mode.flags if given.get(flag)}
     mode = next((each for each in modes if {*each.flags} == picking), None)
     if mode is None:
-        raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(picking))} exclude each other")
+        given_flags = " and ".join(f"`{flag}`" for flag in sorted(picking))
+        more = next(({*each.flags} - picking for each in modes if picking < {*each.flags}), None)
+        raise UsageError(f"{given_flags} needs `{min(more)}`" if more else f"{given_flags} exclude each other")
     for name, value in given.items():
         other = None if value is None else experiment.other_mode(mode, name)
         if other and (value or name not in other.flags):
@@ -113,9 +118,10 @@ def _with(modes: Sequence[RunMode], owners: Collection[RunMode]) -> str:
     if not others:
         return ""
     of, word = (others, "not with") if modes[0] in owners else ([*owners], "with")
-    common = [f"--{flag}" for flag in of[0].flags if all(flag in mode.flags for mode in of)]
-    single = dict.fromkeys(f"--{flag}" for mode in of for flag in mode.flags)
-    return f" ({word} {' '.join(common) or ' or '.join(single)})".replace("_", "-")
+    common = [flag for flag in of[0].flags if all(flag in mode.flags for mode in of)]
+    single = dict.fromkeys(flag for mode in of for flag in mode.flags)
+    spelled = (" " if common else " or ").join(f"--{flag.rstrip('_').replace('_', '-')}" for flag in common or single)
+    return f" ({word} {spelled})"
 
 
 def flags_of(options: type[Options] | Experiment) -> Iterator[Flag]:

@@ -31,7 +31,7 @@ class Recording(ImageMessages):
         self._path, key, topic = where.partition(TOPIC_KEY)
         if key and not topic.startswith("/"):
             raise UsageError(f"`source`: 'bag:{where}' should end with the absolute name of a topic, {TOPIC_KEY}/name")
-        self._reader: Any = _open(self._path)
+        self._reader: Any = open_recording(self._path)
         try:
             self._connection = _connection(self._reader.connections, self._path, topic)
             self._messages: Iterator[tuple[Any, int, bytes]] = self._reader.messages([self._connection])
@@ -60,13 +60,14 @@ class Recording(ImageMessages):
             if entry is not None:
                 return typestore().deserialize_cdr(entry[2], self._connection.msgtype)
         except Exception as error:  # rosbags raises any exception on a damaged file
-            raise SourceError(f"`source`: {_unreadable(self._path, error)}") from error
+            raise unreadable(self._path, error) from error
         raise SourceError(f"`source`: {self._path} holds no picture on {self._connection.topic}; record some")
 
 
-def _open(path: str) -> Any:
+def open_recording(path: str, option: str = "source") -> Any:
+    """Return an open reader of rosbags; raises SourceError, naming the option, for what is no recording."""
     if not Path(path).exists():
-        raise SourceError(f"`source`: no recording at {path}")
+        raise SourceError(f"`{option}`: no recording at {path}")
     try:
         metadata = Path(path) / "metadata.yaml"
         if metadata.is_file() and re.search("<<|!!|!<|%TAG", read_text(metadata)):
@@ -76,7 +77,7 @@ def _open(path: str) -> Any:
         if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
             raise ValueError("a topic's name or type is no text")
     except Exception as error:  # rosbags raises any exception on a damaged file
-        raise SourceError(f"`source`: {_unreadable(path, error)}") from error
+        raise unreadable(path, error, option) from error
     return reader
 
 
@@ -94,9 +95,9 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
     )
 
 
-def _unreadable(path: str, error: Exception) -> str:
+def unreadable(path: str, error: Exception, option: str = "source") -> SourceError:
     reason = " ".join(str(error).split())[:MOST_QUOTED] or type(error).__name__
-    return (
-        f"{path} is no recording that can be read ({reason}); it should be a rosbag2 folder, "
+    return SourceError(
+        f"`{option}`: {path} is no recording that can be read ({reason}); it should be a rosbag2 folder, "
         "a .mcap or a .db3 file. `mcap recover` repairs an .mcap that was cut short, `ros2 bag reindex` a folder"
     )

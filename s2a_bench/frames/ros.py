@@ -84,11 +84,7 @@ class TopicCamera(ImageMessages):
         listed = f"topics of pictures here: {', '.join(others[:10]) or 'none'}"
         if there:
             raise TransportError(f"{self._topic} is of type {', '.join(types)}; {listed}")
-        raise TransportError(
-            f"{self._topic} has no publisher after {self._wait_s:g} s; {listed}. "
-            f"Is ROS_DOMAIN_ID (or `?domain_id=` of the {self.option}) the publisher's, and is "
-            "ROS_AUTOMATIC_DISCOVERY_RANGE SUBNET if it is on another host?"
-        )
+        raise TransportError(unpublished(self._topic, self._wait_s, listed, f"the {self.option}"))
 
     def _receive(self) -> None:
         while not self._closed:
@@ -121,3 +117,12 @@ class TopicCamera(ImageMessages):
                 "buffers: `s2a-bench doctor`"
             )
         return newest
+
+
+def unpublished(topic: str, wait_s: float, listed: str, where: str) -> str:
+    """Return the error of a topic without a publisher, with what is there and ``where`` the domain is named."""
+    return (
+        f"{topic} has no publisher after {wait_s:g} s; {listed}. "
+        f"Is ROS_DOMAIN_ID (or `?domain_id=` of {where}) the publisher's, and is "
+        "ROS_AUTOMATIC_DISCOVERY_RANGE SUBNET if it is on another host?"
+    )

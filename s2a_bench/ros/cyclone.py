@@ -30,6 +30,8 @@ PARTICIPANT_ENTITIES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 NODE_ENTITIES = "rmw_dds_common/msg/NodeEntitiesInfo"
 BEST_EFFORT = Policy.Reliability.BestEffort
 GID = "rmw_dds_common/msg/Gid"
+UNTYPED = "typehash_unknown=;"
+"""Announced for a type that we do not know; ROS matches by name, and says nothing about it."""
 
 
 def _gid(guid: bytes) -> Any:
@@ -70,7 +72,8 @@ class NodeAnnouncement:
 
 
 def _topic_qos(qos: QoS, type_name: str, version: str = DEFAULT_VERSION) -> Qos:
-    return dds_qos(qos, f"typehash={type_hash(type_name, version)};")
+    known = type_name in ros.typestore(version).fielddefs
+    return dds_qos(qos, f"typehash={type_hash(type_name, version)};" if known else UNTYPED)
 
 
 class _CyclonePublisher(RawWriter):

@@ -145,3 +145,15 @@ def test_help_tells_the_default_of_every_field() -> None:
     assert about["t-nom"] == "seconds a skill takes [default: 1]"
     assert list(about) == ["runs", "t-nom", "names", "lengths", "quick", "threads", "model"]
     assert inspect.signature(command(print, Asked, about="Try it.")).parameters["runs"].default is None
+
+
+class Keyword(Options):
+    in_: str = option("", "a topic", flag="in", pattern="^/")
+
+
+def test_a_flag_may_be_a_keyword_of_python() -> None:
+    (flag,) = flags_of(Keyword)
+    assert (flag.key, flag.spelled, flag.path) == ("in_", "--in", ("in_",))
+    assert run("--in", "/a", options=Keyword) == Keyword(in_="/a")
+    with pytest.raises(UsageError, match=r"^--in: 'a' should match pattern"):
+        run("--in", "a", options=Keyword)
