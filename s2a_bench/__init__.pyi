@@ -433,6 +433,31 @@ class _TimelineLive(_Run, _Shared1, total=False):
     tokens_per_skill: _Several[int]
     track: bool
 
+class _WatchTap(_Run, total=False):
+    control_hz: float | None
+    listen: str
+    no_auth: bool
+    requests: int
+    seconds: float
+    to: str
+
+class _WatchTopics(_Run, total=False):
+    control_hz: float | None
+    in: str
+    in_: str
+    out: str
+    requests: int
+    seconds: float
+
+class _WatchBag(_Run, total=False):
+    bag: str | Path
+    control_hz: float | None
+    in: str
+    in_: str
+    out: str
+    requests: int
+    seconds: float
+
 def boundary(**options: Unpack[_Boundary]) -> Run:
     """Show at which rates and granularities naive execution never stalls: by formula, and by trying every point."""
 
@@ -493,3 +518,15 @@ def timeline(*, mode: Literal["real-time"], **options: Unpack[_TimelineRealTime]
 @overload
 def timeline(*, mode: Literal["live"], **options: Unpack[_TimelineLive]) -> Run:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
+
+@overload
+def watch(*, mode: Literal["tap"] = ..., **options: Unpack[_WatchTap]) -> Run:
+    """Measure a robot that runs already: a tap between it and its server, ROS 2 topics, or a recording of them."""
+
+@overload
+def watch(*, mode: Literal["topics"], **options: Unpack[_WatchTopics]) -> Run:
+    """Measure a robot that runs already: a tap between it and its server, ROS 2 topics, or a recording of them."""
+
+@overload
+def watch(*, mode: Literal["bag"], **options: Unpack[_WatchBag]) -> Run:
+    """Measure a robot that runs already: a tap between it and its server, ROS 2 topics, or a recording of them."""

@@ -63,6 +63,7 @@ PLUGINS = {
         Named("capacity", "No such command 'capacity'", "--help", "capacity "),
         Named("task", "No such command 'task'", "--help", "task "),
     ],
+    "watch": [Named("watch", "No such command 'watch'", "--help", "watch ")],
     "rclpy": [Named("latency --middleware rclpy", "--middleware: 'rclpy' is none of ", "latency --help-all", "rclpy")],
     "zenoh": [
         Named("latency --middleware zenoh", "--middleware: 'zenoh' is none of ", "latency --help-all", "zenoh"),

@@ -15,11 +15,13 @@ from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.task.config import TaskVirtual
+from s2a_bench.plugins.watch.config import WatchBag
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of, source_line
 from s2a_bench.writers.style import paper_column
+from tests.made_bags import CAMERA, TOKENS, record, tokens
 
 Make = Callable[[Path, Any], StoredRun]
 FIGURES = {
@@ -31,6 +33,7 @@ FIGURES = {
     "latency": ("latency_bars", "stages", "distribution"),
     "throughput": ("throughput_bars", "gaps", "positions"),
     "timeline": ("timeline",),
+    "watch": ("cycles",),
 }
 
 
@@ -45,6 +48,10 @@ def measured(name: str, _: Path, make_run: Any) -> StoredRun:
     cells = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
     run: StoredRun = make_run(cells, n=3, engine="llama", manifest={"provenance": origins.to_manifest()})
     return StoredRun(run.path, {**run.manifest, "command": name}, run.tables)
+
+
+def watched(root: Path, _: Any) -> StoredRun:
+    return computed("watch", WatchBag(bag=record(root / "bag", tokens()), in_=CAMERA, out=TOKENS), root, _)
 
 
 POLE: dict[str, Any] = {
@@ -65,9 +72,11 @@ RUNS: dict[str, Make] = {
     "task": partial(computed, "task", TaskVirtual(**POLE)),
     "throughput": partial(measured, "throughput"),
     "timeline": partial(computed, "timeline", TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))),
+    "watch": watched,
 }
 EMULATED, DUMMY = "no engine, tokens EMULATED, virtual time", "llama (DUMMY WEIGHTS), tokens PACED"
-LINES = {"latency": DUMMY, "throughput": DUMMY, "task": "echo (no model), tokens EMULATED, virtual time"}
+SEEN = "engine UNKNOWN (the server does not report it), RECORDED, link UNKNOWN"
+LINES = {"watch": SEEN, "latency": DUMMY, "throughput": DUMMY, "task": "echo (no model), tokens EMULATED, virtual time"}
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from s2a_bench.facts import PAYLOAD_BYTES, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import SERVER, TransportOptions, Transport
+from s2a_bench.transport import SERVER, TransportOptions, Transport, Urls
 
 TOY_MESSAGES = Fact("toy_messages", "messages", "messages of the answer")
 
@@ -29,6 +29,8 @@ class Toy(Transport[ToyOptions]):
     style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#8C564B", "-")}
     client_class = "s2a_toy.wire:ToyClient"
     server_class = "s2a_toy.wire:ToyServer"
+    reader = "s2a_toy.tap:ToyReader"
+    urls = Urls(("toy",))
 
     def addresses(self, options: ToyOptions) -> Iterable[str]:
         """Return the address of a new server: the port that was asked for, and any free one."""

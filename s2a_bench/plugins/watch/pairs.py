@@ -1,0 +1,102 @@
+"""Which answer on one topic belongs to which observation on another; no I/O."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+from s2a_bench.transport.tap import MOST_WAITING, Seen
+
+STAMP, ORDER = "header stamp", "order"
+HOW: Final = {
+    STAMP: "an answer has the stamp of its observation",
+    ORDER: "an answer belongs to the newest observation before it",
+}
+UNDECIDED: Final = 10
+"""Answers among which none with an observation's stamp makes their order count; the first may be to unseen ones."""
+
+
+class Message(NamedTuple):
+    answer: bool
+    at_ns: int
+    size: int
+    stamp_ns: int | None = None
+    """Of its header; None for a type without one, and for one that was not set."""
+
+
+class Pairs:
+    """Pairs observations with their answers; both are fed in order of time.
+
+    They pair by stamp if one of the first `UNDECIDED` answers has that of an observation, else by order; see `HOW`.
+    Several answers to an observation are pieces of one; it is told of when another one is answered, and at the end.
+    """
+
+    def __init__(self, what: str, tell: Callable[[Seen], None], *, stamped: bool) -> None:
+        """``stamped``: whether the types of both have a header."""
+        self.observations = self.answers = self.unpaired = 0
+        self.paired = "" if stamped else ORDER
+        self.content: Any = None
+        """What an observation is, for the next exchange to show."""
+        self._what, self._tell = what, tell
+        self._held = deque[Message](maxlen=MOST_WAITING)
+        self._waiting: dict[int, Seen] = {}
+        self._newest = self._key = 0
+        self._open: Seen | None = None
+
+    def feed(self, message: Message) -> None:
+        self.observations += not message.answer
+        self.answers += message.answer
+        if message.answer and not self.observations:
+            self.unpaired += 1
+        elif self.paired:
+            self._pair(message)
+        else:
+            self._hold(message)
+
+    def end(self) -> None:
+        """Tell of the last exchange."""
+        self._decide(self.paired or ORDER)
+        self._close()
+
+    def _hold(self, message: Message) -> None:
+        """Keep a message until it is known what pairs them."""
+        self._held.append(message)
+        answers = self.answers - self.unpaired
+        if message.answer and message.stamp_ns in {each.stamp_ns for each in self._held if not each.answer} - {None}:
+            self._decide(STAMP)
+        elif answers >= UNDECIDED or (answers and len(self._held) == MOST_WAITING):
+            self._decide(ORDER)
+
+    def _decide(self, paired: str) -> None:
+        self.paired = paired
+        while self._held:
+            self._pair(self._held.popleft())
+
+    def _pair(self, message: Message) -> None:
+        self._newest += not message.answer
+        key = message.stamp_ns if self.paired == STAMP else self._newest
+        if not message.answer:
+            if key is not None:
+                self._waiting[key] = Seen(self._what, message.at_ns, up_bytes=message.size)
+                if len(self._waiting) > MOST_WAITING:
+                    del self._waiting[next(iter(self._waiting))]
+            return
+        if key in self._waiting:
+            self._close()
+            self._key, self._open = key, self._waiting.pop(key)
+        if self._open is None or key != self._key:
+            self.unpaired += 1
+            return
+        self._open.answered_ns = self._open.answered_ns or message.at_ns
+        self._open.ended_ns = message.at_ns
+        self._open.down_bytes += message.size
+        self._open.pieces_ns.append(message.at_ns)
+
+    def _close(self) -> None:
+        if seen := self._open:
+            self._open = None
+            if seen.pieces_ns == [seen.answered_ns]:
+                seen.pieces_ns.clear()
+            seen.observation, self.content = self.content, None
+            self._tell(seen)
