@@ -443,7 +443,6 @@ class _WatchTap(_Run, total=False):
 
 class _WatchTopics(_Run, total=False):
     control_hz: float | None
-    in: str
     in_: str
     out: str
     requests: int
@@ -452,7 +451,6 @@ class _WatchTopics(_Run, total=False):
 class _WatchBag(_Run, total=False):
     bag: str | Path
     control_hz: float | None
-    in: str
     in_: str
     out: str
     requests: int

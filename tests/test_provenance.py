@@ -19,7 +19,7 @@ import s2a_bench as s2a
 from s2a_bench.boards.profile import to_toml
 from s2a_bench.experiments import EXPERIMENTS, Shown, write_shown
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.provenance import Origins, Provenance, joined
+from s2a_bench.provenance import SEEN, Origins, Provenance, joined
 from s2a_bench.report.compare.agreement import differences
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
@@ -29,6 +29,7 @@ from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.figures import new_figure, save
 from s2a_bench.writers.latex import to_float, to_latex
 from s2a_bench.writers.tables import TextTable, to_markdown
+from tests.made_bags import CAMERA, TOKENS, record, tokens
 
 LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": True, "model_sha256": "ab"}
 

@@ -83,7 +83,7 @@ def keywords(options: type[Options]) -> Iterator[tuple[str, str]]:
     for flag in distinct([*flags_of(options)]):
         if not flag.hidden:
             field = _field(options, flag.path)
-            for name in dict.fromkeys((flag.path[-1], flag.name.replace("-", "_"))):
+            for name in dict.fromkeys((flag.path[-1], flag.key)):
                 if name not in NOT_GIVEN:
                     yield name, type_of(field.annotation, field.metadata)
 

@@ -1,66 +1,50 @@
-"""The last minute of a watch on a terminal: how often, how long, and what the robot sends."""
+"""The last minute of a watch on a terminal, in the table that its run will have."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
+import pandas as pd
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from s2a_bench.clock import now_ns
-from s2a_bench.experiments.cells import metrics_of
+from s2a_bench.experiments.cells import Cells
 from s2a_bench.plugins.watch.rows import ExchangeRow
-from s2a_bench.stats import summary_of
+from s2a_bench.plugins.watch.view import cycle_table
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.text import one_line
-from s2a_bench.writers.tables import ABSENT, number
+from s2a_bench.writers.tables import lay_out
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-LAST_S: Final = 60
-MOST: Final = 20_000
-"""Exchanges that are looked at."""
-COLUMNS: Final = ("period_s", "upload_s", "server_s", "inference_s", "download_s", "think_s")
+LAST_NS: Final = 60 * 10**9
+MOST: Final = 2_000
+"""Exchanges that are looked at, once in `AGAIN_NS`."""
+AGAIN_NS: Final = 10**9
 
 
 @dataclass(slots=True)
 class LastMinute:
     rows: deque[ExchangeRow] = field(default_factory=lambda: deque(maxlen=MOST))
     sends: dict[str, str] = field(default_factory=dict)
-    """Cell -> what its requests hold."""
+    """Kind of exchange -> what its requests hold."""
+    _drawn: RenderableType = "nothing has passed in the last minute"
+    _drawn_ns: int = 0
 
-    def draw(self, width: int) -> RenderableType:  # noqa: ARG002 - rich fits tables itself
-        since_ns = now_ns() - LAST_S * 10**9
-        by_cell: dict[str, list[ExchangeRow]] = {}
-        for row in list(self.rows):
-            if row.asked_ns > since_ns:
-                by_cell.setdefault(row.cell, []).append(row)
-        table = Table("last minute", "n", "failed", "Hz", *(_titles()), "p99 age", box=None, header_style="bold")
-        for cell, rows in by_cell.items():
-            table.add_row(one_line(cell), *_entries(rows))
-        return Group(table, *(Text(f"{one_line(cell)} sends {each}") for cell, each in list(self.sends.items())))
+    def draw(self, width: int) -> RenderableType:
+        if now_ns() - self._drawn_ns > AGAIN_NS:
+            self._drawn_ns = now_ns()
+            rows = [asdict(row) for row in list(self.rows) if row.asked_ns > self._drawn_ns - LAST_NS]
+            if rows:
+                cells = Cells(pd.DataFrame(rows), ExchangeRow, Origins(Provenance())).split()
+                sends = (Text(one_line(f"{cell} sends {each}")) for cell, each in list(self.sends.items()))
+                self._drawn = Group(lay_out(cycle_table(cells), width), *sends)
+        return self._drawn
 
     def lines(self) -> Iterator[str]:
         return iter(())  # the run's own table follows
-
-
-def _titles() -> list[str]:
-    return [metrics_of(ExchangeRow)[name].title for name in COLUMNS]
-
-
-def _entries(rows: Sequence[ExchangeRow]) -> Iterator[str]:
-    """Yield how many, how many failed, how often, medians of times in ms, and the 99th percentile of the age."""
-    metrics = metrics_of(ExchangeRow)
-    spent_s = (rows[-1].asked_ns - rows[0].asked_ns) / 1e9
-    yield str(len(rows))
-    yield str(sum(bool(row.error) for row in rows))
-    yield f"{(len(rows) - 1) / spent_s:.1f}" if spent_s > 0 else ABSENT
-    for name in (*COLUMNS, "age_s"):
-        summary = summary_of(np.array([value for row in rows if (value := metrics[name].read(row)) is not None]))
-        which = "p99" if name == "age_s" else "median"
-        yield ABSENT if summary is None else f"{number(getattr(summary, which) * 1e3)} ms"

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from s2a_bench.transport.tap import MOST_WAITING, Seen
 
 STAMP, ORDER = "header stamp", "order"
-HOW: Final = {
-    STAMP: "an answer has the stamp of its observation",
-    ORDER: "an answer belongs to the newest observation before it",
-}
 UNDECIDED: Final = 10
 """Answers among which none with an observation's stamp makes their order count; the first may be to unseen ones."""
 
@@ -28,7 +24,8 @@ class Message(NamedTuple):
 class Pairs:
     """Pairs observations with their answers; both are fed in order of time.
 
-    They pair by stamp if one of the first `UNDECIDED` answers has that of an observation, else by order; see `HOW`.
+    They pair by stamp if one of the first `UNDECIDED` answers has that of an observation, else by order: then an answer
+    belongs to the newest observation before it.
     Several answers to an observation are pieces of one; it is told of when another one is answered, and at the end.
     """
 
@@ -36,8 +33,6 @@ class Pairs:
         """``stamped``: whether the types of both have a header."""
         self.observations = self.answers = self.unpaired = 0
         self.paired = "" if stamped else ORDER
-        self.content: Any = None
-        """What an observation is, for the next exchange to show."""
         self._what, self._tell = what, tell
         self._held = deque[Message](maxlen=MOST_WAITING)
         self._waiting: dict[int, Seen] = {}
@@ -98,5 +93,4 @@ class Pairs:
             self._open = None
             if seen.pieces_ns == [seen.answered_ns]:
                 seen.pieces_ns.clear()
-            seen.observation, self.content = self.content, None
             self._tell(seen)

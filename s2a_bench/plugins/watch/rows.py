@@ -60,9 +60,9 @@ class ExchangeRow:
     ]
     up_bytes: Annotated[int, Metric("up", "Of the request.", "bytes")]
     down_bytes: Annotated[int, Metric("down", "Of the answer.", "bytes", "neither")]
-    pieces: Annotated[int, Metric("pieces", "Tokens or partial actions of a stream.", better="neither")]
-    horizon: Annotated[int | None, Metric("H", "Actions of the chunk.", better="neither")]
-    dim: Annotated[int | None, Metric("D", "Numbers of an action.", better="neither")]
+    pieces: Annotated[int, Metric("stream", "Tokens or partial actions.", "pieces", "neither")]
+    horizon: Annotated[int | None, Metric("chunk", "H, the actions of an answer.", "actions", "neither")]
+    dim: Annotated[int | None, Metric("action", "D, the numbers of an action.", "numbers", "neither")]
     error: str = ""
 
 

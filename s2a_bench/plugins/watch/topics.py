@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Container, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -16,11 +15,9 @@ from rosbags.typesys import get_types_from_msg
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, TransportError, UsageError
 from s2a_bench.frames.bag import open_recording, unreadable
-from s2a_bench.frames.convert import to_bgr
-from s2a_bench.frames.messages import TYPES
 from s2a_bench.frames.ros import POLL_S, unpublished
-from s2a_bench.plugins.watch.pairs import HOW, Message, Pairs
-from s2a_bench.plugins.watch.run import SWITCH_S, Watch, opened
+from s2a_bench.plugins.watch.pairs import Message, Pairs
+from s2a_bench.plugins.watch.run import Watch, opened
 from s2a_bench.policy.parameters import build
 from s2a_bench.provenance import AT_TOPICS, RECORDED, Provenance
 from s2a_bench.ros import Middleware, QoS, Subscription
@@ -47,20 +44,10 @@ class Topic:
     """A subscription to one of the two, or its like in a recording."""
 
     answer: bool
-    type_name: str
     stamped: bool
 
     def message(self, at_ns: int, cdr: Any) -> Message:
         return Message(self.answer, at_ns, len(cdr), stamp_of(cdr) if self.stamped else None)
-
-    def content(self, cdr: Any) -> Any:
-        """Return the picture in a message; None for other types, and for what cannot be read."""
-        if self.type_name in TYPES:
-            with suppress(TransportError, ValueError):
-                message = ros.deserialise(memoryview(cdr), self.type_name)
-                raw = self.type_name == ros.IMAGE
-                return to_bgr(ros.frame_of_image(message)) if raw else bytes(message.data)
-        return None
 
 
 def stamp_of(cdr: Any) -> int | None:
@@ -109,14 +96,10 @@ def _received(found: list[tuple[Topic, Subscription]], pairs: Pairs, progress: P
                 if packed := subscription.take(POLL_S):
                     with lock:
                         pairs.feed(topic.message(now_ns(), packed))
-                    if not topic.answer and pairs.observations == 1:
-                        pairs.content = topic.content(packed)
         except TransportError as error:
             progress.say(str(error))
 
     threads = [Thread(target=receive, args=each, name="topic", daemon=True) for each in found]
-    before_s = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_S)
     for thread in threads:
         thread.start()
     try:
@@ -126,7 +109,6 @@ def _received(found: list[tuple[Topic, Subscription]], pairs: Pairs, progress: P
         for (_, subscription), thread in zip(found, threads, strict=True):
             subscription.interrupt()
             thread.join()
-        sys.setswitchinterval(before_s)
 
 
 def _subscribed(node: Middleware, name: str, wait_s: float, *, answer: bool) -> tuple[Topic, Subscription]:
@@ -146,7 +128,7 @@ def _subscribed(node: Middleware, name: str, wait_s: float, *, answer: bool) -> 
             f"{name} is of type {type_name}, which is not known here: use ?middleware=cyclonedds, which need not know "
             "it, or record it and watch the recording with --bag"
         ) from error
-    return Topic(answer, type_name, is_stamped(type_name)), subscription
+    return Topic(answer, is_stamped(type_name)), subscription
 
 
 def run_bag(config: WatchBag, output: Path, progress: Progress) -> Path:
@@ -165,8 +147,6 @@ def run_bag(config: WatchBag, output: Path, progress: Progress) -> Path:
             for connection, at_ns, cdr in _messages(reader, path, topics, config.seconds):
                 topic = topics[connection.id]
                 pairs.feed(topic.message(at_ns, cdr))
-                if not topic.answer and pairs.observations == 1:
-                    pairs.content = topic.content(cdr)
                 if watch.keep_rest() >= config.requests > 0:
                     break
             return _finish(watch, pairs, names)
@@ -183,7 +163,7 @@ def _recorded(reader: Any, path: str, names: tuple[str, str]) -> dict[int, Topic
             raise SourceError(f"`{field}`: {path} has no topic {name}; it has {_listed(there)}")
     try:
         return {
-            each.id: Topic(each.topic == names[1], each.msgtype, is_stamped(each.msgtype, each.msgdef))
+            each.id: Topic(each.topic == names[1], is_stamped(each.msgtype, each.msgdef))
             for each in reader.connections
             if each.topic in names
         }
@@ -231,5 +211,4 @@ def _finish(watch: Watch, pairs: Pairs, names: tuple[str, str]) -> Path:
     if not exchanges:
         counted = f"{pairs.observations} messages of {names[0]}, {pairs.answers} of {names[1]}"
         raise TransportError(f"no exchange was seen: {counted}, none of them an answer after an observation")
-    watch.progress.say(f"paired by {pairs.paired}: {HOW[pairs.paired]}; {pairs.unpaired} answers belong to none")
     return watch.writer.path

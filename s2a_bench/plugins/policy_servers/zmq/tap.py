@@ -35,8 +35,7 @@ NAME: Final = 40
 class ZmqReader(ParsedReader):
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
         """Read the greeting, and then frame after frame, with commands between the frames of a message."""
-        signature = yield from incoming.read(10)
-        if (signature[0], signature[9]) != (0xFF, 0x7F):
+        if (yield from incoming.begin()) != 0xFF or (yield from incoming.read(10))[9] != 0x7F:  # noqa: PLR2004 - its signature
             raise ValueError("no ZeroMQ")
         greeting = yield from incoming.read(54)
         if greeting[0] < 3 or greeting[2:22].rstrip(b"\0") not in MECHANISMS:  # noqa: PLR2004 - its version
