@@ -291,7 +291,7 @@ class Transport(Generic[O]):
     needs: ClassVar[tuple[str, ...]] = ()
     """The extra of both, and its modules."""
     reader: ClassVar[str] = ""
-    """``module:class`` that reads what passes through a tap, a `tap.Reader`; empty: by who speaks."""
+    """``module:class`` that reads what passes through a tap, a `tap.TapReader`."""
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         self.check_machine()

@@ -1,7 +1,7 @@
 """What passes between a client and a server of others, read from copies of the bytes that a tap passes on.
 
-A transport declares its reader (`Transport.reader`), a subclass of `Reader`: it finds where requests and answers begin
-and end. It does no I/O, keeps at most `MOST_BYTES` of one message, and may raise anything: the tap goes on without it.
+A transport declares its reader (`Transport.reader`), a subclass of `TapReader`: it finds where requests and answers
+begin and end. It does no I/O, keeps at most `MOST_BYTES` of one message, and may raise anything: the tap goes on.
 """
 
 from __future__ import annotations
@@ -15,12 +15,15 @@ MOST_BYTES: Final = 64 << 20
 """Of a message that is decoded."""
 MOST_WAITING: Final = 1000
 """Requests of a connection that wait for their answers."""
-MOST_KINDS: Final = 100
-"""Kinds of requests whose first one is decoded."""
+MOST_KINDS: Final = 32
+OTHERS: Final = "others"
+"""The kind of all requests after so many kinds."""
 MOST_PIECES: Final = 1 << 20
 """Of an answer, which need not end."""
 LETTERS: Final = 100
-"""Of kinds of exchanges, and of errors."""
+"""Of kinds of exchanges."""
+FAILED: Final = "an error in place of an answer"
+"""What an error becomes: what a server says may have a key in it, or what the robot was told."""
 
 
 @dataclass(slots=True, eq=False)
@@ -31,13 +34,13 @@ class Seen:
     """
 
     what: str
-    asked_ns: int
+    request_ns: int
     """First byte of the request arrived."""
     sent_ns: int = 0
     """Its last byte was passed on."""
-    answered_ns: int = 0
+    answer_ns: int = 0
     """First byte of the answer arrived."""
-    ended_ns: int = 0
+    end_ns: int = 0
     """Its last byte was passed on."""
     up_bytes: int = 0
     down_bytes: int = 0
@@ -48,20 +51,20 @@ class Seen:
     chunk: tuple[int, int] | None = None
     """Actions of the answer, and numbers of each: (H, D)."""
     observation: Any = None
-    """The decoded request, where `Reader.fresh` asked for it: numbers, texts, bytes and arrays in lists and dicts."""
+    """The decoded request, if it is the first of its kind: numbers, texts, bytes and arrays in lists and dicts."""
     error: str = ""
 
 
-class Reader:
+class TapReader:
     """Pairs the requests of one connection with its answers, in order; subclasses read `up` and `down`.
 
-    A subclass calls `ask` at the first byte of a request and `asked` at its last one, then `answer` and `answered`.
-    What a server sends while no request waits, a greeting for example, is no answer.
+    A subclass calls `begin_request` at the first byte of a request and `end_request` at its last one, then
+    `begin_answer` and `end_answer`. What a server sends while no request waits, such as a greeting, is no answer.
     """
 
-    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
-        """Call ``tell`` with each exchange; ``known`` are the kinds whose requests need not be decoded any more."""
-        self.tell = tell
+    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
+        """Call ``report`` with each exchange; ``known`` are the kinds whose requests need not be decoded any more."""
+        self.report = report
         self.pings = 0
         self.from_ns = self.to_ns = 0
         """When the bytes that are read arrived, and when they had been passed on."""
@@ -79,31 +82,32 @@ class Reader:
     def down(self, data: bytes) -> None:
         raise NotImplementedError
 
-    def fresh(self, what: str) -> bool:
-        """Whether a request is the first of its kind, whose content is wanted."""
-        fresh = what not in self._known and len(self._known) < MOST_KINDS
-        if fresh:
-            self._known.add(what)
+    def fresh(self, seen: Seen) -> bool:
+        """Whether a request is the first of its kind, whose content is wanted; beyond `MOST_KINDS` all are one kind."""
+        if seen.what not in self._known and len(self._known) >= MOST_KINDS:
+            seen.what = OTHERS
+        fresh = seen.what not in self._known
+        self._known.add(seen.what)
         return fresh
 
-    def ask(self, what: str = "") -> Seen:
+    def begin_request(self, what: str = "") -> Seen:
         seen = Seen(what, self.from_ns)
         self._waiting.append(seen)
         if len(self._waiting) > MOST_WAITING:
             raise ValueError(f"more than {MOST_WAITING} requests without an answer")
         return seen
 
-    def asked(self, seen: Seen, size: int) -> None:
+    def end_request(self, seen: Seen, size: int) -> None:
         seen.up_bytes = size
-        if not seen.answered_ns:  # else the server did not wait for the request's end
+        if not seen.answer_ns:  # else the server did not wait for the request's end
             seen.sent_ns = self.to_ns
 
-    def answer(self) -> Seen | None:
+    def begin_answer(self) -> Seen | None:
         """Return the exchange whose answer these bytes belong to, None for bytes that nobody asked for."""
         if not self._waiting:
             return None
         seen = self._waiting[0]
-        seen.answered_ns = seen.answered_ns or self.from_ns
+        seen.answer_ns = seen.answer_ns or self.from_ns
         seen.sent_ns = seen.sent_ns or self.from_ns
         return seen
 
@@ -112,37 +116,37 @@ class Reader:
         if len(seen.pieces_ns) < MOST_PIECES:
             seen.pieces_ns.append(self.to_ns)
 
-    def answered(self, seen: Seen, size: int) -> None:
-        """End the exchange of `answer`."""
+    def end_answer(self, seen: Seen, size: int) -> None:
+        """End the exchange of `begin_answer`."""
         self._waiting.popleft()
-        seen.ended_ns, seen.down_bytes = self.to_ns, size
-        self.tell(seen)
+        seen.end_ns, seen.down_bytes = self.to_ns, size
+        self.report(seen)
 
     def end(self) -> None:
         """Tell of the requests that a connection ended without an answer to."""
         for seen in self._waiting:
             seen.error = seen.error or "the connection ended before the answer"
-            self.tell(seen)
+            self.report(seen)
         self._waiting.clear()
 
 
-class Turns(Reader):
-    """Any protocol, by who speaks: a request begins where the client does, and its answer where the server does."""
+class TurnsReader(TapReader):
+    """Any protocol, by turns: a request is what the client sends until the server does, the answer what follows."""
 
     def up(self, data: bytes) -> None:
-        if self._waiting and self._waiting[0].ended_ns:
+        if self._waiting and self._waiting[0].end_ns:
             self.end()
-        seen = self._waiting[0] if self._waiting else self.ask("turns")
-        self.asked(seen, seen.up_bytes + len(data))
+        seen = self._waiting[0] if self._waiting else self.begin_request("turns")
+        self.end_request(seen, seen.up_bytes + len(data))
 
     def down(self, data: bytes) -> None:
-        if seen := self.answer():
-            seen.ended_ns = self.to_ns
+        if seen := self.begin_answer():
+            seen.end_ns = self.to_ns
             seen.down_bytes += len(data)
 
     def end(self) -> None:
-        if self._waiting and self._waiting[0].ended_ns:
-            self.tell(self._waiting.popleft())
+        if self._waiting and self._waiting[0].end_ns:
+            self.report(self._waiting.popleft())
         super().end()
 
 
@@ -181,11 +185,11 @@ class Incoming:
             del self._bytes[:here]
 
 
-class ParsedReader(Reader):
+class ParsedTapReader(TapReader):
     """A reader whose directions are parsed by a generator each, `messages`."""
 
-    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(tell, known)
+    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
+        super().__init__(report, known)
         self._up = Incoming(lambda incoming: self.messages(incoming, up=True))
         self._down = Incoming(lambda incoming: self.messages(incoming, up=False))
 

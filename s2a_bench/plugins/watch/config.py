@@ -13,6 +13,7 @@ from s2a_bench.errors import PortInUse, UsageError
 from s2a_bench.options import Options, option
 from s2a_bench.transport import TRANSPORTS, Transport, named_by
 from s2a_bench.transport.listening import check_url, is_loopback
+from s2a_bench.transport.risks import is_local
 
 PORTS: Final = {"http": 80, "ws": 80, "https": 443, "wss": 443}
 """Those of URLs without one."""
@@ -77,8 +78,8 @@ class WatchTap(WatchOptions):
         host = host.strip("[]") or "127.0.0.1"
         if not (self.no_auth or is_loopback(host)):
             raise UsageError(f"`listen`: others reach {host}, and the server through it; allow it with `no_auth`")
-        if (host, int(port)) == self.server:
-            raise UsageError(f"`listen`: {self.listen} is the server's own address; listen at another port")
+        if int(port) == self.server[1] and is_local(self.server[0]):
+            raise UsageError(f"`listen`: {port} is the server's own port; listen at another one")
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             return socket.create_server((host, int(port)), family=family)

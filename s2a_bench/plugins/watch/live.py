@@ -39,7 +39,7 @@ class LastMinute:
     def draw(self, width: int) -> RenderableType:
         if now_ns() - self._drawn_ns > AGAIN_NS:
             self._drawn_ns = now_ns()
-            rows = [asdict(row) for row in list(self.rows) if row.asked_ns > self._drawn_ns - LAST_NS]
+            rows = [asdict(row) for row in list(self.rows) if row.request_ns > self._drawn_ns - LAST_NS]
             if rows:
                 cells = Cells(pd.DataFrame(rows), ExchangeRow, Origins(Provenance())).split()
                 sends = (Text(one_line(f"{cell} sends {each}")) for cell, each in list(self.sends.items()))

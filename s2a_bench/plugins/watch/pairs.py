@@ -10,10 +10,10 @@ from s2a_bench.transport.tap import MOST_WAITING, Seen
 
 STAMP, ORDER = "header stamp", "order"
 UNDECIDED: Final = 10
-"""Answers among which none with an observation's stamp makes their order count; the first may be to unseen ones."""
+"""Stamps of answers among which none is an observation's, so that order counts; the first may be of unseen ones."""
 
 
-class Message(NamedTuple):
+class TopicMessage(NamedTuple):
     answer: bool
     at_ns: int
     size: int
@@ -29,17 +29,19 @@ class Pairs:
     Several answers to an observation are pieces of one; it is told of when another one is answered, and at the end.
     """
 
-    def __init__(self, what: str, tell: Callable[[Seen], None], *, stamped: bool) -> None:
+    def __init__(self, what: str, report: Callable[[Seen], None], *, stamped: bool) -> None:
         """``stamped``: whether the types of both have a header."""
         self.observations = self.answers = self.unpaired = 0
         self.paired = "" if stamped else ORDER
-        self._what, self._tell = what, tell
-        self._held = deque[Message](maxlen=MOST_WAITING)
+        self._what, self._report = what, report
+        self._held = deque[TopicMessage](maxlen=MOST_WAITING)
+        self._strange = set[int | None]()
+        """Stamps of answers that no observation has."""
         self._waiting: dict[int, Seen] = {}
         self._newest = self._key = 0
         self._open: Seen | None = None
 
-    def feed(self, message: Message) -> None:
+    def feed(self, message: TopicMessage) -> None:
         self.observations += not message.answer
         self.answers += message.answer
         if message.answer and not self.observations:
@@ -54,13 +56,14 @@ class Pairs:
         self._decide(self.paired or ORDER)
         self._close()
 
-    def _hold(self, message: Message) -> None:
+    def _hold(self, message: TopicMessage) -> None:
         """Keep a message until it is known what pairs them."""
         self._held.append(message)
-        answers = self.answers - self.unpaired
+        if message.answer:
+            self._strange.add(message.stamp_ns)
         if message.answer and message.stamp_ns in {each.stamp_ns for each in self._held if not each.answer} - {None}:
             self._decide(STAMP)
-        elif answers >= UNDECIDED or (answers and len(self._held) == MOST_WAITING):
+        elif len(self._strange) >= UNDECIDED or (self._strange and len(self._held) == MOST_WAITING):
             self._decide(ORDER)
 
     def _decide(self, paired: str) -> None:
@@ -68,7 +71,7 @@ class Pairs:
         while self._held:
             self._pair(self._held.popleft())
 
-    def _pair(self, message: Message) -> None:
+    def _pair(self, message: TopicMessage) -> None:
         self._newest += not message.answer
         key = message.stamp_ns if self.paired == STAMP else self._newest
         if not message.answer:
@@ -83,14 +86,14 @@ class Pairs:
         if self._open is None or key != self._key:
             self.unpaired += 1
             return
-        self._open.answered_ns = self._open.answered_ns or message.at_ns
-        self._open.ended_ns = message.at_ns
+        self._open.answer_ns = self._open.answer_ns or message.at_ns
+        self._open.end_ns = message.at_ns
         self._open.down_bytes += message.size
         self._open.pieces_ns.append(message.at_ns)
 
     def _close(self) -> None:
         if seen := self._open:
             self._open = None
-            if seen.pieces_ns == [seen.answered_ns]:
+            if seen.pieces_ns == [seen.answer_ns]:
                 seen.pieces_ns.clear()
-            self._tell(seen)
+            self._report(seen)

@@ -2,105 +2,117 @@
 
 from __future__ import annotations
 
-import select
 import socket
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from threading import Lock, Thread
+from threading import Lock, Thread, current_thread
 from typing import Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.transport.connections import Connections, Wire
 from s2a_bench.transport.limits import LIMITS
-from s2a_bench.transport.tap import Reader, Seen, Turns
+from s2a_bench.transport.tap import Seen, TapReader, TurnsReader
 
-PART_BYTES: Final = 1 << 18
+PART_BYTES: Final = 1 << 19
 """Most bytes that are read at once."""
-MOST_HELD: Final = 64
+MOST_HELD: Final = 16
 """Parts that wait for one that is not passed on yet, as its receiver does not read; the reader then goes on."""
 CONNECT_S: Final = 10.0
 
 
 @dataclass(slots=True, eq=False)
-class Client:
+class TappedClient:
     """One client of the server, from connection to connection."""
 
     number: int
     host: str
+    wire: Wire | None = None
+    """Its connection; None between two."""
 
 
 @dataclass(slots=True)
 class Totals:
     connections: int = 0
     reconnects: int = 0
+    """Connections of a client that had one before."""
     unreachable: int = 0
     """Connections for which the server was not there."""
     unread: int = 0
-    """Connections that went on by who speaks, as their reader failed."""
+    """Connections that were read by turns, as their reader failed."""
     pings: int = 0
-    up_bytes: int = 0
-    down_bytes: int = 0
 
 
 @dataclass(eq=False)
-class Relay:
+class ByteRelay:
     """Passes connections of ``listener`` on to a server, each read by a reader of its own.
 
-    ``reader`` makes one of ``tell`` and the known kinds. ``tell`` is called with the number of a client and each of its
-    exchanges, on the threads of connections, ``say`` with a line where something is wrong.
+    ``reader`` makes one of ``report`` and the known kinds. ``report`` is called with the number of a client and each of
+    its exchanges, on the threads of connections, ``say`` with a line where something is wrong.
     """
 
     listener: socket.socket
     server: tuple[str, int]
-    reader: Callable[[Callable[[Seen], None], set[str]], Reader]
-    tell: Callable[[int, Seen], None]
+    reader: Callable[[Callable[[Seen], None], set[str]], TapReader]
+    report: Callable[[int, Seen], None]
     say: Callable[[str], None]
     totals: Totals = field(default_factory=Totals)
 
     def __post_init__(self) -> None:
         self._lock = Lock()
-        self._clients: list[Client] = []
-        self._left: dict[str, list[Client]] = {}
+        self._clients: list[TappedClient] = []
+        self._joined: dict[socket.socket, Thread] = {}
         self._known: set[str] = set()
-        self._said: set[str] = set()
+        self._lines: set[str] = set()
         self._connections = Connections(self.listener, self._handle, LIMITS.connections, b"")
 
     def serve(self) -> None:
-        """Relay until `stop`."""
+        """ByteRelay until `stop`; then connections are ended, and what passed is read to its end."""
         self._connections.serve()
+        for server, thread in list(self._joined.items()):
+            with suppress(OSError):
+                server.shutdown(socket.SHUT_RDWR)
+            thread.join()
 
     def stop(self) -> None:
         self._connections.stop()
 
     def _handle(self, wire: Wire) -> None:
-        client = self._client_at(wire.socket.getpeername()[0])
+        client, server = self._client_of(wire), None
         try:
-            with socket.create_connection(self.server, CONNECT_S) as server:
-                server.settimeout(None)
-                self._join(client, wire.socket, server)
+            server = socket.create_connection(self.server, CONNECT_S)
+            server.settimeout(None)
+            self._joined[server] = current_thread()
+            self._join(client, wire.socket, server)
         except OSError as error:
             self.totals.unreachable += 1
             self._once(f"nothing answers at {self.server[0]}:{self.server[1]}: {error}; connections are closed")
         finally:
-            with self._lock:
-                self._left.setdefault(client.host, []).append(client)
+            client.wire = None if client.wire is wire else client.wire
+            if server:
+                del self._joined[server]
+                server.close()
 
-    def _client_at(self, host: str) -> Client:
-        """Return who connects: the client of this host that left last, else a new one."""
+    def _client_of(self, wire: Wire) -> TappedClient:
+        """Return who connects: a client of that host whose connection has ended, else a new one."""
+        host = wire.socket.getpeername()[0]
         with self._lock:
             self.totals.connections += 1
-            if left := self._left.get(host):
-                self.totals.reconnects += 1
-                return left.pop()
-            self._clients.append(Client(len(self._clients), host))
-            return self._clients[-1]
+            for client in self._clients:
+                if client.host == host and (client.wire is None or client.wire.disconnected()):
+                    self.totals.reconnects += 1
+                    break
+            else:
+                client = TappedClient(len(self._clients), host)
+                self._clients.append(client)
+            client.wire = wire
+            return client
 
-    def _join(self, client: Client, robot: socket.socket, server: socket.socket) -> None:
+    def _join(self, client: TappedClient, robot: socket.socket, server: socket.socket) -> None:
         for each in (robot, server):
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        passed = Passed(self.reader(lambda seen: self.tell(client.number, seen), self._known), self._failed)
+        passed = Passed(self.reader(lambda seen: self.report(client.number, seen), self._known), self._failed)
         down = Thread(target=_pass, args=(server, robot, passed), kwargs={"up": False}, name="down", daemon=True)
         down.start()
         _pass(robot, server, passed, up=True)
@@ -108,20 +120,15 @@ class Relay:
         passed.end()
         with self._lock:
             self.totals.pings += passed.reader.pings
-            self.totals.up_bytes += passed.bytes[True]
-            self.totals.down_bytes += passed.bytes[False]
 
     def _failed(self, error: Exception) -> None:
-        with self._lock:
-            self.totals.unread += 1
-        self._once(f"what passes is not what was expected ({error}); such connections are read by who speaks")
+        self.totals.unread += 1
+        self._once(f"what passes is not what was expected ({error}); such connections are read by turns")
 
     def _once(self, line: str) -> None:
-        with self._lock:
-            if line in self._said or len(self._said) >= MOST_HELD:
-                return
-            self._said.add(line)
-        self.say(line)
+        if line not in self._lines and len(self._lines) < MOST_HELD:
+            self._lines.add(line)
+            self.say(line)
 
 
 @dataclass(slots=True, eq=False)
@@ -136,11 +143,10 @@ class Part:
 
 
 class Passed:
-    """Shows a reader what passed in both directions in order of arrival, whichever thread is the first to tell."""
+    """Shows a reader what passed in both directions, in order of arrival."""
 
-    def __init__(self, reader: Reader, failed: Callable[[Exception], None]) -> None:
+    def __init__(self, reader: TapReader, failed: Callable[[Exception], None]) -> None:
         self.reader = reader
-        self.bytes = {True: 0, False: 0}
         self._failed = failed
         self._lock = Lock()
         self._parts = deque[Part]()
@@ -150,32 +156,11 @@ class Passed:
         self._parts.append(part)
         return part
 
-    @property
-    def full(self) -> bool:
-        return len(self._parts) > MOST_HELD
-
-    @property
-    def _ready(self) -> bool:
-        return bool(self._parts) and (self._parts[0].to_ns > 0 or self.full)
-
     def read(self) -> None:
-        """Read what has been passed on, up to a part that has not been; nobody waits for a thread that reads."""
-        while self._ready and self._lock.acquire(blocking=False):
-            try:
-                while self._ready:
-                    self._read(self._parts.popleft())
-            finally:
-                self._lock.release()
-
-    def _read(self, part: Part) -> None:
-        self.bytes[part.up] += len(part.data)
-        times = part.from_ns, part.to_ns or part.from_ns
-        try:
-            self.reader.passed(part.data, *times, up=part.up)
-        except Exception as error:  # noqa: BLE001 - no reader's error is the robot's
-            self._failed(error)
-            self.reader = Turns(self.reader.tell, set())
-            self.reader.passed(part.data, *times, up=part.up)
+        """Read what has been passed on, up to a part that has not been yet, which may be the request before it."""
+        with self._lock:
+            while self._parts and (self._parts[0].to_ns or len(self._parts) > MOST_HELD):
+                self._read(self._parts.popleft())
 
     def end(self) -> None:
         """Read the rest, once both directions have ended."""
@@ -184,21 +169,25 @@ class Passed:
         with suppress(Exception):
             self.reader.end()
 
+    def _read(self, part: Part) -> None:
+        times = part.from_ns, part.to_ns or part.from_ns
+        try:
+            self.reader.passed(part.data, *times, up=part.up)
+        except Exception as error:  # noqa: BLE001 - no reader's error is the robot's
+            self._failed(error)
+            self.reader = TurnsReader(self.reader.report, set())
+            self.reader.passed(part.data, *times, up=part.up)
+
 
 def _pass(source: socket.socket, target: socket.socket, passed: Passed, *, up: bool) -> None:
-    """Pass bytes on until one side ends, then end the other: its half, or both if the connection broke.
-
-    They are read while nothing waits to be passed on.
-    """
-    how, more = socket.SHUT_WR, select.poll()
-    more.register(source, select.POLLIN)
+    """Pass bytes on until one side ends, then end the other: its half, or both if the connection broke."""
+    how = socket.SHUT_WR
     try:
         while data := source.recv(PART_BYTES):
             part = passed.arrived(data, up=up)
             target.sendall(data)
             part.to_ns = now_ns()
-            if passed.full or not more.poll(0):
-                passed.read()
+            passed.read()
     except OSError:
         how = socket.SHUT_RDWR
         with suppress(OSError):

@@ -16,20 +16,19 @@ if TYPE_CHECKING:
 
 STAGES: Final = {"upload": "network", "server": "server", "inference": "inference", "download": "return"}
 """Stages of an exchange -> their groups, in its order."""
-MOST_CELLS: Final = 32
-OTHERS: Final = "others"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExchangeRow:
     """One exchange, as it was seen between the two; a time that is not known is null.
 
-    `upload`, `server`, `inference`, `download` and the next row's `think` add up to the next row's `period`.
+    Of a client that waits for each answer `upload`, `server`, `inference`, `download` and the next row's `think` add up
+    to the next row's `period`.
     """
 
     cell: str
     client: int
-    asked_ns: int
+    request_ns: int
     upload_ns: Annotated[int | None, Metric("upload", "First byte of the request to its last one.")]
     server_ns: Annotated[
         int | None,
@@ -74,41 +73,39 @@ COMPARED: Final = Comparable.of(EXCHANGES, ("period_s", "upload_s", "server_s", 
 class Before:
     """What is known of a client's exchanges of one kind so far."""
 
-    asked_ns: int = 0
-    ended_ns: int = 0
+    request_ns: int = 0
+    end_ns: int = 0
     lasts_until_ns: int = 0
     """When its actions are used up, if none was ever dropped."""
 
 
 @dataclass(slots=True)
-class Cycles:
-    """Turns what was seen into rows, client by client."""
+class SeenCycles:
+    """TurnsReader what was seen into rows, client by client."""
 
     tick_ns: float = 0.0
     """Of the robot's control loop; 0: not known."""
     _before: dict[tuple[int, str], Before] = field(default_factory=dict)
-    _cells: set[str] = field(default_factory=set)
 
     def row(self, client: int, seen: Seen) -> ExchangeRow:
-        if seen.what not in self._cells and len(self._cells) >= MOST_CELLS:
-            seen.what = OTHERS
-        self._cells.add(seen.what)
         before = self._before.setdefault((client, seen.what), Before())
-        sent_ns, first_ns = seen.sent_ns or seen.asked_ns, first_of(seen)
-        infer_ns = None if seen.infer_ms is None else max(0, min(round(seen.infer_ms * 1e6), first_ns - sent_ns))
-        good = not seen.error and bool(seen.ended_ns)
+        sent_ns, first_ns = seen.sent_ns or seen.request_ns, first_of(seen)
+        infer_ns = None if seen.infer_ms is None else round(seen.infer_ms * 1e6)
+        if infer_ns is not None and not 0 <= infer_ns <= first_ns - sent_ns:
+            infer_ns = None  # it is no part of this time
+        good = not seen.error and bool(seen.end_ns)
         row = ExchangeRow(
             cell=seen.what,
             client=client,
-            asked_ns=seen.asked_ns,
-            upload_ns=seen.sent_ns - seen.asked_ns if good and seen.sent_ns else None,
+            request_ns=seen.request_ns,
+            upload_ns=seen.sent_ns - seen.request_ns if good and seen.sent_ns else None,
             server_ns=first_ns - sent_ns - (infer_ns or 0) if good else None,
             inference_ns=infer_ns if good else None,
-            download_ns=seen.ended_ns - first_ns if good else None,
-            think_ns=_since(before.ended_ns, seen.asked_ns),
-            period_ns=_since(before.asked_ns, seen.asked_ns),
-            age_ns=(seen.pieces_ns[0] if seen.pieces_ns else seen.ended_ns) - seen.asked_ns if good else None,
-            dry_ns=self._dry_ns(before, seen) if good else None,
+            download_ns=seen.end_ns - first_ns if good else None,
+            think_ns=_since(before.end_ns, seen.request_ns),
+            period_ns=_since(before.request_ns, seen.request_ns),
+            age_ns=(seen.pieces_ns[0] if seen.pieces_ns else seen.end_ns) - seen.request_ns if good else None,
+            dry_ns=self._dry_ns(before, seen if good else None),
             up_bytes=seen.up_bytes,
             down_bytes=seen.down_bytes,
             pieces=len(seen.pieces_ns),
@@ -116,12 +113,16 @@ class Cycles:
             dim=seen.chunk[1] if seen.chunk else None,
             error=seen.error or ("" if good else "no answer"),
         )
-        before.asked_ns, before.ended_ns = seen.asked_ns, seen.ended_ns
+        before.request_ns, before.end_ns = seen.request_ns, seen.end_ns
         return row
 
-    def _dry_ns(self, before: Before, seen: Seen) -> int | None:
-        """Return for how long no action can have been left before this answer, even if none was ever dropped."""
-        if not (self.tick_ns and seen.chunk):
+    def _dry_ns(self, before: Before, seen: Seen | None) -> int | None:
+        """Return for how long no action can have been left before this answer, even if none was ever dropped.
+
+        After an answer whose actions are not known nothing is, up to the next one.
+        """
+        if not (self.tick_ns and seen and seen.chunk):
+            before.lasts_until_ns = 0
             return None
         at_ns, left_ns = first_of(seen), before.lasts_until_ns
         before.lasts_until_ns = max(left_ns, at_ns) + round(seen.chunk[0] * self.tick_ns)
@@ -130,7 +131,7 @@ class Cycles:
 
 def first_of(seen: Seen) -> int:
     """Return when the answer began: of a stream, its first piece."""
-    return seen.pieces_ns[0] if seen.pieces_ns else seen.answered_ns
+    return seen.pieces_ns[0] if seen.pieces_ns else seen.answer_ns
 
 
 def _since(before_ns: int, at_ns: int) -> int | None:
@@ -139,7 +140,7 @@ def _since(before_ns: int, at_ns: int) -> int | None:
 
 def sample_of(row: ExchangeRow, seen: Seen, number: int, transport: str) -> SampleRow:
     """Return the exchange as other commands read requests: a chain of marks up to its first piece, or its end."""
-    at_ns, marks = seen.asked_ns, list[Mark]()
+    at_ns, marks = seen.request_ns, list[Mark]()
     if not row.error:
         marks.append(("", at_ns))
         for stage in STAGES if not seen.pieces_ns else [*STAGES][:-1]:

@@ -19,8 +19,8 @@ from s2a_bench.errors import TransportError
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks
 from s2a_bench.plugins.watch.live import LastMinute
-from s2a_bench.plugins.watch.relay import Relay
-from s2a_bench.plugins.watch.rows import EXCHANGES, STAGES, Cycles, sample_of, tokens_of
+from s2a_bench.plugins.watch.relay import ByteRelay
+from s2a_bench.plugins.watch.rows import EXCHANGES, STAGES, SeenCycles, sample_of, tokens_of
 from s2a_bench.plugins.watch.shapes import described
 from s2a_bench.progress import watching
 from s2a_bench.provenance import AT_TAP, UNKNOWN, Origins, Provenance
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
 POLL_S: Final = 0.1
-MOST_TOLD: Final = 10_000
+MOST_REPORTED: Final = 10_000
 """Exchanges that wait to be written."""
 SWITCH_S: Final = 5e-5
 """The longest time for which a thread that reads, or writes rows, keeps others from passing on; Python's is 5 ms."""
@@ -43,7 +43,7 @@ SWITCH_S: Final = 5e-5
 
 @dataclass(slots=True)
 class Watch:
-    """A run that keeps what it is told: `tell` may be called from any thread, `keep` writes."""
+    """A run that keeps what it is told: `report` may be called from any thread, `keep` writes."""
 
     config: WatchOptions
     writer: RunWriter
@@ -52,8 +52,8 @@ class Watch:
     view: LastMinute = field(default_factory=LastMinute)
     lost: int = 0
     """Exchanges that came faster than rows can be written."""
-    _told: Queue[tuple[int, Seen]] = field(default_factory=lambda: Queue(MOST_TOLD))
-    _cycles: Cycles = field(default_factory=Cycles)
+    _reported: Queue[tuple[int, Seen]] = field(default_factory=lambda: Queue(MOST_REPORTED))
+    _cycles: SeenCycles = field(default_factory=SeenCycles)
     _numbers: Iterator[int] = field(default_factory=count)
     _kept: int = 0
 
@@ -64,9 +64,9 @@ class Watch:
     def _full(self) -> bool:
         return self._kept >= self.config.requests > 0
 
-    def tell(self, client: int, seen: Seen) -> None:
+    def report(self, client: int, seen: Seen) -> None:
         try:
-            self._told.put_nowait((client, seen))
+            self._reported.put_nowait((client, seen))
         except Full:
             self.lost += 1
 
@@ -77,12 +77,12 @@ class Watch:
         with suppress(KeyboardInterrupt), watching(self.progress, self.view):
             while not ((self.config.seconds and now_ns() >= ends_ns) or self._kept >= self.config.requests > 0):
                 with suppress(Empty):
-                    self._keep(*self._told.get(timeout=POLL_S))
+                    self._keep(*self._reported.get(timeout=POLL_S))
 
     def keep_rest(self) -> int:
         """Write what was told since, and return how many exchanges there were."""
-        while not (self._told.empty() or self._full):
-            self._keep(*self._told.get())
+        while not (self._reported.empty() or self._full):
+            self._keep(*self._reported.get())
         return self._kept
 
     def _keep(self, client: int, seen: Seen) -> None:
@@ -115,13 +115,13 @@ def opened(
 
 
 def run_tap(config: WatchTap, output: Path, progress: Progress) -> Path:
-    """Relay until the end and return the run folder; raises S2AError, also if no exchange was seen."""
+    """ByteRelay until the end and return the run folder; raises S2AError, also if no exchange was seen."""
     transport = config.transport
     transport.check_machine()
-    reader = resolve_name(transport.reader or "s2a_bench.transport.tap:Turns")
+    reader = resolve_name(transport.reader or "s2a_bench.transport.tap:TurnsReader")
     origin = Provenance(tokens=AT_TAP, link="real" if is_local(config.server[0]) else UNKNOWN)
     with config.bound() as listener, opened(config, output, progress, transport.name, origin) as watch:
-        relay = Relay(listener, config.server, reader, watch.tell, progress.say)
+        relay = ByteRelay(listener, config.server, reader, watch.report, progress.say)
         host, port = listener.getsockname()[:2]
         at = f"{urlsplit(config.to).scheme}://{in_url(host)}:{port}"
         progress.say(f"listening at {at}: let the robot connect there instead of to {config.to}")
@@ -131,14 +131,13 @@ def run_tap(config: WatchTap, output: Path, progress: Progress) -> Path:
         watch.writer.update(tap={**asdict(totals), "lost": watch.lost})
         if not exchanges:
             raise TransportError(
-                f"no exchange was seen: {totals.connections} connections, {totals.up_bytes} bytes from the robot and "
-                f"{totals.down_bytes} from the server; let the robot connect to {at}"
+                f"no exchange was seen over {totals.connections} connections; let the robot connect to {at}"
             )
         return watch.writer.path
 
 
 @contextmanager
-def _served(relay: Relay) -> Iterator[None]:
+def _served(relay: ByteRelay) -> Iterator[None]:
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     keep_large_blocks()

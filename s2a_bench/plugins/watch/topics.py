@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Container, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,7 +16,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, TransportError, UsageError
 from s2a_bench.frames.bag import open_recording, unreadable
 from s2a_bench.frames.ros import POLL_S, unpublished
-from s2a_bench.plugins.watch.pairs import Message, Pairs
+from s2a_bench.plugins.watch.pairs import ORDER, Pairs, TopicMessage
 from s2a_bench.plugins.watch.run import Watch, opened
 from s2a_bench.policy.parameters import build
 from s2a_bench.provenance import AT_TOPICS, RECORDED, Provenance
@@ -25,6 +25,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.join import RosParameters
 from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import appeared
+from s2a_bench.store.manifest import RunWarning
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,8 +47,8 @@ class Topic:
     answer: bool
     stamped: bool
 
-    def message(self, at_ns: int, cdr: Any) -> Message:
-        return Message(self.answer, at_ns, len(cdr), stamp_of(cdr) if self.stamped else None)
+    def message(self, at_ns: int, cdr: Any) -> TopicMessage:
+        return TopicMessage(self.answer, at_ns, len(cdr), stamp_of(cdr) if self.stamped else None)
 
 
 def stamp_of(cdr: Any) -> int | None:
@@ -199,7 +200,7 @@ def _listed(topics: Iterable[str]) -> str:
 
 def _pairs(watch: Watch, names: tuple[str, str], topics: Iterable[Topic]) -> Pairs:
     stamped = all(topic.stamped for topic in topics)
-    return Pairs(" -> ".join(names), lambda seen: watch.tell(0, seen), stamped=stamped)
+    return Pairs(" -> ".join(names), lambda seen: watch.report(0, seen), stamped=stamped)
 
 
 def _finish(watch: Watch, pairs: Pairs, names: tuple[str, str]) -> Path:
@@ -211,4 +212,11 @@ def _finish(watch: Watch, pairs: Pairs, names: tuple[str, str]) -> Path:
     if not exchanges:
         counted = f"{pairs.observations} messages of {names[0]}, {pairs.answers} of {names[1]}"
         raise TransportError(f"no exchange was seen: {counted}, none of them an answer after an observation")
+    if pairs.paired == ORDER and pairs.observations > exchanges + 1:
+        unanswered = f"{pairs.observations - exchanges} of {pairs.observations} observations have no answer"
+        about = (
+            f"paired by order, and {unanswered}: an answer may be to an older one, server and age are at least those"
+        )
+        advice = "give both topics headers with the same stamps"
+        watch.writer.update(warnings=[asdict(RunWarning("paired-by-order", about, advice))])
     return watch.writer.path

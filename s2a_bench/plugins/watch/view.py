@@ -37,6 +37,8 @@ CYCLES: Final = 8
 MOST_LANES: Final = 12
 SEEN: Final = "Seen between the two: what the client does before its request and after the answer is in think."
 
+AT_LEAST: Final = "That is a lower bound: a robot that drops actions, or starts them late, is dry more often."
+
 
 def show(run: StoredRun, **_: Any) -> Shown:
     exchanges = Cells.of(run, EXCHANGES)
@@ -64,11 +66,10 @@ def sentences(cells: Exchanges, manifest: Mapping[str, Any]) -> Iterator[str]:
             yield f"{name} sends {sends}."
         dry_s, horizon = cell.values("dry_s"), cell.values("horizon")
         if hz and dry_s.size:
-            yield (
-                f"{name}: {horizon.max():g} actions last {horizon.max() / hz * 1e3:g} ms at {hz:g} Hz; none can have "
-                f"been left before {int((dry_s > 0).sum())} of {dry_s.size} answers, for up to {dry_s.max() * 1e3:.0f} "
-                "ms. That is a lower bound: a robot that drops actions, or starts them late, is dry more often."
-            )
+            dry = dry_s[dry_s > 0]
+            lasts = f"{name}: {horizon.max():g} actions last {horizon.max() / hz * 1e3:g} ms at {hz:g} Hz"
+            longest = f", for up to {dry.max() * 1e3:.0f} ms" if dry.size else ""
+            yield f"{lasts}; none can have been left before {dry.size} of {dry_s.size} answers{longest}. {AT_LEAST}"
     for what in ("tap", "topics"):
         counted = [f"{name} {value}" for name, value in manifest.get(what, {}).items() if value]
         if counted:
@@ -118,10 +119,10 @@ def build_cycles(cells: Exchanges, *, dry: bool) -> Figure:
 
 
 def _draw_lane(axes: Axes, place: int, rows: pd.DataFrame) -> None:
-    zero_ns = rows["asked_ns"].min()
+    zero_ns = rows["request_ns"].min()
     for row in rows.to_dict("records"):
         spent = {part: 0.0 if pd.isna(row[f"{part}_ns"]) else row[f"{part}_ns"] / 1e6 for part in (*PARTS, "dry")}
-        asked_ms = at_ms = (row["asked_ns"] - zero_ns) / 1e6
+        asked_ms = at_ms = (row["request_ns"] - zero_ns) / 1e6
         answered_ms = asked_ms + spent["upload"] + spent["server"] + spent["inference"]
         for part, (colour, hatch) in PARTS.items():
             start_ms = asked_ms - spent[part] if part == "think" else at_ms

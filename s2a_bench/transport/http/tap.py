@@ -7,9 +7,9 @@ without a length ends with its connection.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from http import HTTPStatus
 from math import isfinite, nan
 from typing import Any, Final
@@ -18,20 +18,21 @@ import httptools
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.facts import PREDICTED_MS, PROMPT_MS
-from s2a_bench.secrets import struck
 from s2a_bench.transport.http.dialects import DIALECTS, NATIVE, Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.decoder import ODD, Decoder
 from s2a_bench.transport.http.dialects.framing import Framing, JsonLines, ServerSentEvents, WholeBody
-from s2a_bench.transport.http.dialects.openai import METRICS, OpenAI
-from s2a_bench.transport.tap import LETTERS, MOST_BYTES, Reader, Seen
+from s2a_bench.transport.http.dialects.openai import METRICS
+from s2a_bench.transport.tap import FAILED, LETTERS, MOST_BYTES, Seen, TapReader
 from s2a_bench.vectors import actions_of
 
 WHOLE_BYTES: Final = 4 << 20
 """Of an answer in one piece that is decoded."""
 HEAD_BYTES: Final = 1 << 20
+PLAIN: Final = re.compile(r"[A-Za-z._-]{0,40}\d{0,2}|v\d\w*")
+"""A part of a path that is kept: others may be names of users, or keys."""
 FIRST_MS: Final = PROMPT_MS, METRICS["time_to_first_token_ms"]
-"""What servers tell of the time up to the first token."""
+"""What servers report of the time up to the first token."""
 FRAMINGS: Final[Mapping[str, Callable[[], Framing]]] = {
     "text/event-stream": ServerSentEvents,
     "application/json": WholeBody,
@@ -61,28 +62,25 @@ def loaded(text: Any) -> Any:
 
 
 class Lenient(Dialect):
-    """The dialect of a path; a message that it cannot read is a piece all the same, and any of another path."""
+    """The dialect of a path; of another path any message is a piece, and one that the dialect cannot read."""
 
     def __init__(self, path: str) -> None:
-        of_path = (
-            kind for name, kind in DIALECTS.loaded() if name != NATIVE and kind.path and path.endswith(kind.path)
-        )
-        known = next(of_path, None)
-        self._known, self._dialect = known is not None, (known or OpenAI)()
+        kinds = (kind for name, kind in DIALECTS.loaded() if name != NATIVE and kind.path)
+        self._dialect = next((kind() for kind in kinds if path.endswith(kind.path)), None)
         self.chunk: tuple[int, int] | None = None
 
     def event(self, message: Any) -> Event:
         self.chunk = chunk_of(message)
         with suppress(RequestFailed, *ODD):
-            event = self._dialect.event(message)
-            return event if self._known else replace(event, text="")
+            if self._dialect:
+                return self._dialect.event(message)
         return Event("")
 
 
-class Answer:
+class SeenAnswer:
     """The body of an answer, read into what is seen of its exchange."""
 
-    def __init__(self, reader: Reader, seen: Seen, kind: str) -> None:
+    def __init__(self, reader: TapReader, seen: Seen, kind: str) -> None:
         self.seen, self._reader = seen, reader
         self._framing = FRAMINGS.get(kind)
         self._dialect = Lenient(seen.what.partition(" ")[2])
@@ -103,7 +101,7 @@ class Answer:
 
     def _learn(self, event: Event) -> None:
         seen, self._unread = self.seen, 0
-        seen.error = seen.error or struck(event.error)[:LETTERS]
+        seen.error = seen.error or FAILED * bool(event.error)
         whole = self._framing is WholeBody
         if whole:
             seen.chunk = self._dialect.chunk
@@ -115,10 +113,10 @@ class Answer:
             seen.infer_ms = infer_ms
 
 
-class Messages:
+class HttpSide:
     """The callbacks of httptools for one direction."""
 
-    def __init__(self, reader: HttpReader, parser: Callable[[Messages], Any]) -> None:
+    def __init__(self, reader: HttpReader, parser: Callable[[HttpSide], Any]) -> None:
         self.reader, self._new_parser = reader, parser
         self.parser = parser(self)
         self.headers: dict[str, str] = {}
@@ -144,10 +142,10 @@ class Messages:
         self._unread = 0
 
 
-class Requests(Messages):
+class ClientSide(HttpSide):
     def on_message_begin(self) -> None:
         super().on_message_begin()
-        self.seen, self._url, self._body, self._fresh = self.reader.ask("HTTP"), b"", bytearray(), False
+        self.seen, self._url, self._body, self._fresh = self.reader.begin_request("HTTP"), b"", bytearray(), False
 
     def on_url(self, url: bytes) -> None:
         self._url = (self._url + url)[:LETTERS]
@@ -155,8 +153,9 @@ class Requests(Messages):
     def on_headers_complete(self) -> None:
         super().on_headers_complete()
         path = self._url.partition(b"?")[0].decode("latin-1")
-        self.seen.what = f"{self.parser.get_method().decode()} {path}"[:LETTERS]
-        self._fresh = self.reader.fresh(self.seen.what)
+        plain = "/".join(part if PLAIN.fullmatch(part) else "*" for part in path.split("/"))
+        self.seen.what = f"{self.parser.get_method().decode()} {plain}"
+        self._fresh = self.reader.fresh(self.seen)
 
     def on_body(self, data: bytes) -> None:
         super().on_body(data)
@@ -165,24 +164,24 @@ class Requests(Messages):
         self._body += data if self._fresh else b""
 
     def on_message_complete(self) -> None:
-        self.reader.asked(self.seen, self.seen.up_bytes)
+        self.reader.end_request(self.seen, self.seen.up_bytes)
         if self._fresh:
             self.seen.observation = loaded(self._body)
 
 
-class Answers(Messages):
-    answer: Answer | None = None
+class ServerSide(HttpSide):
+    answer: SeenAnswer | None = None
 
     def on_headers_complete(self) -> None:
         super().on_headers_complete()
         status = self.parser.get_status_code()
-        seen = self.reader.answer() if status >= HTTPStatus.OK else None
+        seen = self.reader.begin_answer() if status >= HTTPStatus.OK else None
         if seen is None:
             return
-        seen.answered_ns = self.began_ns
+        seen.answer_ns = self.began_ns
         seen.error = f"HTTP {status}" if status >= HTTPStatus.BAD_REQUEST else ""
         kind = self.headers.get("content-type", "").partition(";")[0].strip()
-        self.answer = Answer(self.reader, seen, "" if "content-encoding" in self.headers else kind)
+        self.answer = SeenAnswer(self.reader, seen, "" if "content-encoding" in self.headers else kind)
         if seen.what.startswith("HEAD "):  # its answer has a length and no body, which httptools would wait for
             self.on_message_complete()
             self.parser = self._new_parser(self)
@@ -195,15 +194,15 @@ class Answers(Messages):
     def on_message_complete(self) -> None:
         if self.answer:
             self.answer.end()
-            self.reader.answered(self.answer.seen, self.answer.seen.down_bytes)
+            self.reader.end_answer(self.answer.seen, self.answer.seen.down_bytes)
             self.answer = None
 
 
-class HttpReader(Reader):
-    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(tell, known)
-        self._requests = Requests(self, httptools.HttpRequestParser)
-        self._answers = Answers(self, httptools.HttpResponseParser)
+class HttpReader(TapReader):
+    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
+        super().__init__(report, known)
+        self._requests = ClientSide(self, httptools.HttpRequestParser)
+        self._answers = ServerSide(self, httptools.HttpResponseParser)
 
     def up(self, data: bytes) -> None:
         try:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Generator
 
-from s2a_bench.transport.tap import Incoming, Reader, Seen
+from s2a_bench.transport.tap import Incoming, TapReader, Seen
 from s2a_toy.wire import LENGTH
 
 
-class ToyReader(Reader):
+class ToyReader(TapReader):
     """A request is a message, its answer a message a token and one that ends it."""
 
-    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
+    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
         """Wait for the first bytes of both sides."""
-        super().__init__(tell, known)
+        super().__init__(report, known)
         self._up, self._down = Incoming(self._requests), Incoming(self._answers)
 
     def up(self, data: bytes) -> None:
@@ -28,16 +28,16 @@ class ToyReader(Reader):
     def _requests(self, incoming: Incoming) -> Generator[None, None, None]:
         while True:
             yield from incoming.begin()
-            seen = self.ask("toy")
+            seen = self.begin_request("toy")
             (length,) = LENGTH.unpack((yield from incoming.read(LENGTH.size)))
             yield from incoming.skip(length)
-            self.asked(seen, LENGTH.size + length)
+            self.end_request(seen, LENGTH.size + length)
 
     def _answers(self, incoming: Incoming) -> Generator[None, None, None]:
         size = 0
         while True:
             yield from incoming.begin()
-            seen = self.answer()
+            seen = self.begin_answer()
             (length,) = LENGTH.unpack((yield from incoming.read(LENGTH.size)))
             message = json.loads((yield from incoming.read(length)))
             size += LENGTH.size + length
@@ -45,5 +45,5 @@ class ToyReader(Reader):
                 seen.pieces_ns.append(self.to_ns)
             elif seen:
                 seen.error = str(message.get("error", ""))
-                self.answered(seen, size)
+                self.end_answer(seen, size)
                 size = 0

@@ -21,7 +21,7 @@ from s2a_bench.frames import FrameSource
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.plugins.chunks.modes import Mode
 from s2a_bench.plugins.chunks.testing.mode import ModeSuite
-from s2a_bench.plugins.watch.relay import Relay
+from s2a_bench.plugins.watch.relay import ByteRelay
 from s2a_bench.policy import Policy
 from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
@@ -66,7 +66,7 @@ def test_what_passes_through_a_tap_is_read() -> None:
     server = TOY.server(Wiring("toy", "", ToyOptions()), answer)
     host, _, port = server.address.rpartition(":")
     listener = create_server(("127.0.0.1", 0))
-    relay = Relay(listener, (host, int(port)), ToyReader, lambda _, seen: told.append(seen), print)
+    relay = ByteRelay(listener, (host, int(port)), ToyReader, lambda _, seen: told.append(seen), print)
     threads = [Thread(target=each.serve) for each in (server, relay)]
     for thread in threads:
         thread.start()

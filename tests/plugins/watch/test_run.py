@@ -21,7 +21,6 @@ import pytest
 import s2a_bench as s2a
 from s2a_bench.experiments.cells import Cells
 from s2a_bench.plugins.watch.config import WatchTap
-from s2a_bench.plugins.watch.relay import Relay
 from s2a_bench.plugins.watch.rows import EXCHANGES, ExchangeRow
 from s2a_bench.plugins.watch.run import run_tap
 from s2a_bench.plugins.watch.view import SEEN
@@ -97,8 +96,8 @@ def test_each_exchange_lies_within_what_its_client_saw(robot: tuple[StoredRun, S
     for row, (_, sample) in zip(rows_of(tap), samples.iterrows(), strict=True):
         marks = dict(json.loads(sample["marks"]))
         spent_ns = (row.upload_ns or 0) + (row.server_ns or 0) + (row.inference_ns or 0)
-        assert marks["msgpack_pack"] <= row.asked_ns
-        assert row.asked_ns + spent_ns <= max(marks.values())
+        assert marks["msgpack_pack"] <= row.request_ns
+        assert row.request_ns + spent_ns <= max(marks.values())
         assert (row.error, row.pieces, row.horizon, row.dim) == ("", 0, 8, 7)
         assert row.up_bytes == sample["payload_bytes"]
 
@@ -131,7 +130,7 @@ def test_its_run_is_food_for_the_others(robot: tuple[StoredRun, StoredRun], tmp_
 
 
 def test_no_key_and_no_body_is_written(tmp_path: Path) -> None:
-    secret, body = "sk-verysecretkey", "what the robot was told"
+    secret, body = "sk-very5ecretkey", "what the robot was told"
     with (
         served(wiring_of("http"), RecordingHandler(["le", "ft"])) as (server, _),
         watched(server.address, tmp_path, requests=3) as said,
@@ -147,7 +146,7 @@ def test_no_key_and_no_body_is_written(tmp_path: Path) -> None:
     assert [row.error for row in rows_of(run)] == ["", "", "HTTP 404"]
     written = b"".join(path.read_bytes() for path in run.path.rglob("*") if path.is_file())
     assert body.encode() not in written
-    assert written.count(secret.encode()) == written.count(f"/{secret}".encode())  # a path is a kind of exchange
+    assert secret.encode() not in written
     assert [*run.tokens.groupby("request_id").size()] == [2, 2]
 
 
@@ -176,7 +175,7 @@ def test_a_server_that_sleeps_is_as_slow_as_it_is(sleep_ms: int, tmp_path: Path)
     assert [row.cell for row in rows] == ["turns"] * 4
     assert all(sleep_ms * 1e6 <= (row.server_ns or 0) for row in rows)
     assert all((row.think_ns or 0) >= 20 * 1e6 for row in rows[1:])
-    assert "read by who speaks" in said.lines[1]
+    assert "read by turns" in said.lines[1]
 
 
 @contextmanager
@@ -214,7 +213,7 @@ def test_what_was_seen_is_kept_however_it_ends(how: signal.Signals, tmp_path: Pa
 def test_nothing_seen_is_one_line_and_no_folder(tmp_path: Path) -> None:
     with served(wiring_of(OPENPI), CHUNK) as (server, _):
         line = refused("watch", "--to", server.address, "--seconds", "0.2", "--output", tmp_path / "out", code=1)
-    assert re.search(r"no exchange was seen: 0 connections, .* let the robot connect to ws://127.0.0.1:\d+", line)
+    assert re.search(r"no exchange was seen over 0 connections; let the robot connect to ws://127.0.0.1:\d+", line)
     assert not (tmp_path / "out").exists()
 
 
@@ -226,7 +225,7 @@ def test_nothing_seen_is_one_line_and_no_folder(tmp_path: Path) -> None:
         (("--to", "ros://a"), "--to: 'ros://a' should start with http://"),
         (("--to", "tcp://a"), "--to: 'tcp://a' should end with a port"),
         (("--to", "ws://a", "--listen", "0.0.0.0:0"), "--listen: others reach 0.0.0.0, and the server through it; "),
-        (("--to", "ws://127.0.0.1:81", "--listen", "127.0.0.1:81"), "--listen: 127.0.0.1:81 is the server's own"),
+        (("--to", "ws://localhost:81", "--listen", "81"), "--listen: 81 is the server's own port"),
         (("--to", "ws://a", "--listen", "127.0.0.1:99999"), "--listen: cannot bind 127.0.0.1:99999"),
         (("--to", "ws://a", "--listen", "here"), "--listen: 'here' should match"),
         (("--to", "ws://a", "--control-hz", "0"), "--control-hz: 0"),
@@ -244,12 +243,3 @@ def test_a_plain_port_listens_on_this_machine() -> None:
     assert WatchTap(to="http://gpu-box").server == ("gpu-box", 80)
     with WatchTap(to="http://gpu-box", listen="0.0.0.0:0", no_auth=True).bound() as listener:
         assert listener.getsockname()[0] == "0.0.0.0"  # noqa: S104
-
-
-def test_clients_that_come_and_go_are_few() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        relay = Relay(listener, ("127.0.0.1", 1), lambda *_: pytest.fail("nothing is read"), lambda *_: None, print)
-        for _ in range(1000):
-            client = relay._client_at("10.0.0.1")
-            relay._left.setdefault(client.host, []).append(client)
-        assert (client.number, client.host) == (0, "10.0.0.1")

@@ -18,7 +18,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, TransportError, UsageError
 from s2a_bench.experiments.cells import Cells
 from s2a_bench.plugins.watch.config import WatchBag, WatchTopics
-from s2a_bench.plugins.watch.pairs import ORDER, STAMP, UNDECIDED, Message, Pairs
+from s2a_bench.plugins.watch.pairs import ORDER, STAMP, UNDECIDED, Pairs, TopicMessage
 from s2a_bench.plugins.watch.rows import EXCHANGES, ExchangeRow
 from s2a_bench.plugins.watch.topics import run_bag, run_topics, stamp_of
 from s2a_bench.progress import NullProgress
@@ -40,10 +40,10 @@ def paired(written: str, *, stamped: bool = True) -> tuple[Pairs, list[tuple[int
     seen: list[Seen] = []
     pairs = Pairs(WHAT, seen.append, stamped=stamped)
     for at_ns, each in enumerate(written.split(), 1):
-        pairs.feed(Message(each[0] == "a", at_ns, 10, int(each[1:]) if each[1:] else None))
+        pairs.feed(TopicMessage(each[0] == "a", at_ns, 10, int(each[1:]) if each[1:] else None))
     pairs.end()
     assert all(each.what == WHAT and not each.sent_ns and each.up_bytes == 10 for each in seen)
-    return pairs, [(each.asked_ns, each.answered_ns, each.ended_ns, each.pieces_ns) for each in seen]
+    return pairs, [(each.request_ns, each.answer_ns, each.end_ns, each.pieces_ns) for each in seen]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_types_without_a_header_pair_by_order_at_once() -> None:
     seen: list[Seen] = []
     pairs = Pairs(WHAT, seen.append, stamped=False)
     for at_ns, answer in enumerate((False, True, False, True), 1):
-        pairs.feed(Message(answer, at_ns, 10))
+        pairs.feed(TopicMessage(answer, at_ns, 10))
     assert (len(seen), pairs.paired) == (1, ORDER)
 
 
@@ -94,7 +94,7 @@ def test_stamps_that_never_match_are_given_up_after_a_few_answers() -> None:
 def test_an_observation_is_not_kept_for_ever() -> None:
     late = " ".join(f"o{stamp}" for stamp in range(1, MOST_WAITING + 3))
     pairs, seen = paired(f"{late} a{MOST_WAITING} a1")
-    assert (pairs.unpaired, [asked_ns for asked_ns, *_ in seen]) == (1, [MOST_WAITING])
+    assert (pairs.unpaired, [request_ns for request_ns, *_ in seen]) == (1, [MOST_WAITING])
     assert paired(f"{late} a1")[0].paired == ORDER
     assert paired(late)[0].observations == MOST_WAITING + 2
 
@@ -123,7 +123,7 @@ def test_rows_of_a_recording_are_its_log_times(tmp_path: Path, plugin: StoragePl
     run = read_bag(record(tmp_path / "bag", tokens(), plugin), tmp_path / "out")
     first, second = rows_of(run)
     assert {first.cell, second.cell} == {WHAT}
-    assert [each.asked_ns - T0_NS for each in (first, second)] == [100 * MS, 400 * MS]
+    assert [each.request_ns - T0_NS for each in (first, second)] == [100 * MS, 400 * MS]
     assert first.upload_ns is second.upload_ns is first.inference_ns is None
     assert [each.server_ns for each in (first, second)] == [50 * MS, 25 * MS]
     assert [each.download_ns for each in (first, second)] == [30 * MS, 0]
@@ -141,7 +141,7 @@ def test_a_recording_of_stamped_answers_is_paired_by_stamp(tmp_path: Path) -> No
     messages = [(0, CAMERA, image(1)), (33, CAMERA, image(2)), (66, CAMERA, image(3))]
     messages += [(80, "/pose", pose(1)), (90, "/pose", pose(3))]
     run = read_bag(record(tmp_path / "bag", messages), tmp_path / "out", "/pose")
-    assert [(each.asked_ns - T0_NS, each.server_ns) for each in rows_of(run)] == [(0, 80 * MS), (66 * MS, 24 * MS)]
+    assert [(each.request_ns - T0_NS, each.server_ns) for each in rows_of(run)] == [(0, 80 * MS), (66 * MS, 24 * MS)]
     assert run.manifest["topics"]["paired"] == STAMP
 
 
@@ -167,7 +167,7 @@ def test_types_that_only_the_recording_defines_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("options", "asked_ms"), [({"seconds": 0.4}, [100]), ({"requests": 1}, [100])])
 def test_a_bound_ends_the_reading(tmp_path: Path, options: dict[str, Any], asked_ms: list[int]) -> None:
     run = read_bag(record(tmp_path / "bag", tokens()), tmp_path / "out", **options)
-    assert [(each.asked_ns - T0_NS) // MS for each in rows_of(run)] == asked_ms
+    assert [(each.request_ns - T0_NS) // MS for each in rows_of(run)] == asked_ms
 
 
 @pytest.mark.parametrize("lines", [b"", b"no recording"])
@@ -303,8 +303,8 @@ def test_live_answers_with_the_stamp_of_their_observation(
     for each in rows:
         number = each.up_bytes // (48 * 3) - 64
         assert each.server_ns is not None
-        assert sent_ns[number] <= each.asked_ns
-        assert sent_ns[number] + LATER_NS <= each.asked_ns + each.server_ns <= now_ns()
+        assert sent_ns[number] <= each.request_ns
+        assert sent_ns[number] + LATER_NS <= each.request_ns + each.server_ns <= now_ns()
     assert run.manifest["topics"]["paired"] == STAMP
     assert run.manifest["middleware"]["middleware"] == from_pypi
     assert run.origins.run.tokens == AT_TOPICS

@@ -26,7 +26,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.grpc import LEROBOT
 from s2a_bench.plugins.policy_servers.grpc.client import SERVICE, bytes_in
 from s2a_bench.plugins.policy_servers.grpc.pickles import chunk_in
-from s2a_bench.transport.tap import LETTERS, MOST_PIECES, MOST_WAITING, Incoming, ParsedReader, Seen
+from s2a_bench.transport.tap import LETTERS, MOST_PIECES, MOST_WAITING, Incoming, ParsedTapReader, Seen
 
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 SEND, GET = f"grpc {SERVICE}SendObservations", f"grpc {SERVICE}GetActions"
@@ -43,21 +43,21 @@ OBSERVATIONS: Final = 100
 ERRORS: Final = {str(code.value[0]).encode(): f"gRPC {code.name}" for code in grpc.StatusCode} | {b"0": ""}
 
 
-class Call:
+class SeenCall:
     def __init__(self, seen: Seen) -> None:
         self.seen, self.head, self.chunk = seen, b"", b""
         self.whole = False  # its request
         self._answer = Incoming(self._messages)
 
     def up(self, data: bytes, from_ns: int, to_ns: int) -> None:
-        self.seen.asked_ns = self.seen.asked_ns if self.seen.up_bytes else from_ns
+        self.seen.request_ns = self.seen.request_ns if self.seen.up_bytes else from_ns
         self.seen.sent_ns = to_ns
         self.seen.up_bytes += len(data)
         self.head += data[: HEAD - len(self.head)]
 
     def down(self, data: bytes, from_ns: int, to_ns: int) -> None:
-        self.seen.sent_ns, self.seen.answered_ns = self.seen.sent_ns or from_ns, self.seen.answered_ns or from_ns
-        self.seen.ended_ns = to_ns
+        self.seen.sent_ns, self.seen.answer_ns = self.seen.sent_ns or from_ns, self.seen.answer_ns or from_ns
+        self.seen.end_ns = to_ns
         self.seen.down_bytes += len(data)
         self._answer.feed(data)
 
@@ -69,14 +69,14 @@ class Call:
             else:
                 yield from incoming.skip(size)
             if len(self.seen.pieces_ns) < MOST_PIECES:
-                self.seen.pieces_ns.append(self.seen.ended_ns)
+                self.seen.pieces_ns.append(self.seen.end_ns)
 
 
-class GrpcReader(ParsedReader):
-    def __init__(self, tell: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(tell, known)
-        self._calls: dict[int, Call] = {}
-        self._observations = deque[Call](maxlen=OBSERVATIONS)
+class GrpcReader(ParsedTapReader):
+    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
+        super().__init__(report, known)
+        self._calls: dict[int, SeenCall] = {}
+        self._observations = deque[SeenCall](maxlen=OBSERVATIONS)
 
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
         if up and (yield from incoming.read(len(PREFACE))) != PREFACE:
@@ -106,9 +106,10 @@ class GrpcReader(ParsedReader):
                     call.down(b"", from_ns, self.to_ns)
                     self._over(frame.stream_id, error)
 
-    def _called(self, stream: int, path: bytes, from_ns: int) -> Call:
+    def _called(self, stream: int, path: bytes, from_ns: int) -> SeenCall:
         name = "".join(filter(str.isprintable, path.decode(errors="replace")))[:LETTERS]
-        self._calls[stream] = call = Call(Seen(f"grpc {name}", from_ns))
+        self._calls[stream] = call = SeenCall(Seen(f"grpc {name}", from_ns))
+        self.fresh(call.seen)
         if len(self._calls) > MOST_WAITING:
             raise ValueError(f"more than {MOST_WAITING} calls without an answer")
         if call.seen.what == SEND:
@@ -116,7 +117,7 @@ class GrpcReader(ParsedReader):
         return call
 
     def _over(self, stream: int, error: str) -> None:
-        """End a call, and tell of its exchange."""
+        """End a call, and report of its exchange."""
         call = self._calls.pop(stream, None)
         if call is None:
             return
@@ -129,9 +130,9 @@ class GrpcReader(ParsedReader):
             self._observations.remove(call)
             self._lerobot(call.seen, Seen("", 0, error=error))
         elif call.seen.what not in (SEND, GET):
-            self.tell(call.seen)
+            self.report(call.seen)
 
-    def _got(self, call: Call) -> None:
+    def _got(self, call: SeenCall) -> None:
         """Tell of an observation with its chunk, or the error in place of one."""
         its = [each for each in self._observations if each.whole][-1:]
         with suppress(RequestFailed):
@@ -146,7 +147,7 @@ class GrpcReader(ParsedReader):
 
     def _lerobot(self, sent: Seen, got: Seen) -> None:
         what = f"grpc {LEROBOT}"
-        self.tell(replace(got, what=what, asked_ns=sent.asked_ns, sent_ns=sent.sent_ns, up_bytes=sent.up_bytes))
+        self.report(replace(got, what=what, request_ns=sent.request_ns, sent_ns=sent.sent_ns, up_bytes=sent.up_bytes))
 
     def end(self) -> None:
         for stream in [*self._calls]:

@@ -17,10 +17,9 @@ from websockets.frames import CTRL_OPCODES, Frame, Opcode
 from s2a_bench.errors import RequestFailed
 from s2a_bench.facts import INFER_MS
 from s2a_bench.plugins.policy_servers.websocket import codec
-from s2a_bench.secrets import struck
 from s2a_bench.transport.http.dialects.decoder import ODD
 from s2a_bench.transport.http.tap import WHOLE_BYTES, HttpReader, chunk_of, loaded
-from s2a_bench.transport.tap import LETTERS, MOST_BYTES, Incoming, Seen
+from s2a_bench.transport.tap import FAILED, MOST_BYTES, Incoming, Seen
 
 CONTROL_BYTES: Final = 125
 """The most that a control frame has (RFC 6455, 5.5), and the longest head of any."""
@@ -36,6 +35,7 @@ class Unread(Extension):
 class WebsocketReader(HttpReader):
     _sent: Incoming | None = None
     _came: Incoming | None = None
+    _in_text = False
 
     def upgraded(self, headers: Mapping[str, str]) -> None:
         self._what = f"websocket {self._waiting.popleft().what.partition(' ')[2]}"
@@ -54,7 +54,7 @@ class WebsocketReader(HttpReader):
         while True:
             opcode = (yield from incoming.begin()) & 15
             if opcode in {Opcode.TEXT, Opcode.BINARY}:
-                seen, size, data = self.ask(self._what) if up else self.answer(), 0, bytearray()
+                seen, size, data = self.begin_request(self._what) if up else self.begin_answer(), 0, bytearray()
                 text = opcode == Opcode.TEXT
             wanted = seen and not self._extensions and (not up or self._what not in self._known)
             most = (MOST_BYTES if up else WHOLE_BYTES) - len(data) if wanted else 0
@@ -68,19 +68,20 @@ class WebsocketReader(HttpReader):
                 seen.up_bytes = size
             if frame.fin and seen:
                 value = _decoded(bytes(data), text=text) if wanted and len(data) == size else None
-                (self._request if up else self._answer)(seen, size, value)
+                (self._request if up else self._answer)(seen, size, value, text=text)
                 seen = None
 
-    def _request(self, seen: Seen, size: int, value: Any) -> None:
+    def _request(self, seen: Seen, size: int, value: Any, *, text: bool) -> None:
         if not size:  # some clients keep a connection open with empty messages, which have no answer
             self.pings += 1
             self._waiting.remove(seen)
             return
-        self.fresh(self._what)
+        self.fresh(seen)
+        self._in_text = text
         seen.observation = value
-        self.asked(seen, size)
+        self.end_request(seen, size)
 
-    def _answer(self, seen: Seen, size: int, answer: Any) -> None:
+    def _answer(self, seen: Seen, size: int, answer: Any, *, text: bool) -> None:
         seen.down_bytes += size
         fields = answer if isinstance(answer, dict) else {}
         kind = str(fields.get(codec.TYPE, ""))
@@ -90,15 +91,12 @@ class WebsocketReader(HttpReader):
         with suppress(*ODD):
             infer_ms = float(fields[codec.TIMING][str(INFER_MS)])
             seen.infer_ms = infer_ms if isfinite(infer_ms) else None
-        reason = answer if isinstance(answer, str) or kind == codec.ERROR else fields.get(codec.ERROR)
-        while isinstance(reason, dict):
-            reason = next((reason[key] for key in codec.ERROR_KEYS if key in reason), None)
-        if isinstance(reason, str):
-            seen.error = struck(reason.strip().rpartition("\n")[2])[:LETTERS]
+        traceback = text and not self._in_text  # as openpi sends it
+        seen.error = FAILED * (traceback or kind == codec.ERROR or fields.get(codec.ERROR) is not None)
         if kind == codec.PARTIAL and not seen.error:
             self.piece(seen)
         else:
-            self.answered(seen, seen.down_bytes)
+            self.end_answer(seen, seen.down_bytes)
 
 
 def _frame(
@@ -122,7 +120,7 @@ def _frame(
 def _decoded(data: bytes, *, text: bool) -> Any:
     """Read a message: MessagePack, or a text, which may be JSON; None for bytes that are no message."""
     if text:
-        return loaded(data) or data.decode(errors="replace")
+        return loaded(data)
     with suppress(RequestFailed):
         return codec.unpackb(data)
     return None

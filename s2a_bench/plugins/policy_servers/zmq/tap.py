@@ -15,8 +15,7 @@ import msgpack
 from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.zmq import layouts
 from s2a_bench.plugins.policy_servers.zmq.wire import read
-from s2a_bench.secrets import struck
-from s2a_bench.transport.tap import LETTERS, MOST_BYTES, Incoming, ParsedReader, Seen
+from s2a_bench.transport.tap import FAILED, MOST_BYTES, Incoming, ParsedTapReader, Seen
 
 MORE, LONG, COMMAND = 1, 2, 4
 """Flags of a frame."""
@@ -32,7 +31,7 @@ NAME: Final = 40
 """Most letters of an endpoint."""
 
 
-class ZmqReader(ParsedReader):
+class ZmqReader(ParsedTapReader):
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
         """Read the greeting, and then frame after frame, with commands between the frames of a message."""
         if (yield from incoming.begin()) != 0xFF or (yield from incoming.read(10))[9] != 0x7F:  # noqa: PLR2004 - its signature
@@ -44,7 +43,7 @@ class ZmqReader(ParsedReader):
         while True:
             flags = (yield from incoming.read(1))[0]
             if not flags & COMMAND and not inside:
-                seen, total = (self.ask(WHAT) if up else self.answer()), 0
+                seen, total = (self.begin_request(WHAT) if up else self.begin_answer()), 0
             size = int.from_bytes((yield from incoming.read(8 if flags & LONG else 1)), "big")
             if flags & COMMAND:
                 name = yield from incoming.read(min(size, len(PING)))
@@ -56,15 +55,15 @@ class ZmqReader(ParsedReader):
                 yield from incoming.skip(size)
             elif up:
                 yield from self._request(incoming, seen, size)
-                self.asked(seen, total)
+                self.end_request(seen, total)
             else:
                 yield from self._answer(incoming, seen, size)
-                self.answered(seen, total)
+                self.end_answer(seen, total)
 
     def _request(self, incoming: Incoming, seen: Seen, size: int) -> Generator[None, None, None]:
         head = yield from incoming.read(min(size, HEAD))
         seen.what = what_in(head)
-        if size > MOST_BYTES or not self.fresh(seen.what):
+        if size > MOST_BYTES or not self.fresh(seen):
             yield from incoming.skip(size - len(head))
             return
         rest = yield from incoming.read(size - len(head))
@@ -78,9 +77,9 @@ class ZmqReader(ParsedReader):
             return
         body = yield from incoming.read(size)
         with suppress(RequestFailed):
-            answer = {layouts.ERROR: body.decode()} if body == b"ERROR" else read(body)[0]  # N1.5's, of any exception
+            answer = {layouts.ERROR: ""} if body == b"ERROR" else read(body)[0]  # N1.5's, of any exception
             if isinstance(answer, dict) and layouts.ERROR in answer:
-                seen.error = struck(str(answer[layouts.ERROR]))[:LETTERS] or layouts.ERROR
+                seen.error = FAILED
             elif seen.what == ACT:
                 actions = layouts.actions_in(answer)
                 seen.chunk = len(actions), len(actions[0].values)
