@@ -175,7 +175,7 @@ def session(kind: int, **options: Any) -> tuple[list[Seen], Copies, int]:
         ("zmq get_action", len(BODIES[1]) + more, len(ANSWER) + more, (4, 3), ""),
         ("zmq get_action", len(BODIES[2]) + more, len(ERROR) + more, None, FAILED),
         ("zmq get_action", len(BODIES[3]) + more, len(LARGE) + more, None, ""),
-        ("zmq", 1 + more, 5 + more, None, "ERROR"),
+        ("zmq", 1 + more, 5 + more, None, FAILED),
         ("zmq", len(BODIES[5]) + more, len(OK) + more, None, ""),
     ]
     return tap.seen, tap.copies, tap.relay.totals.pings

@@ -92,7 +92,7 @@ class WebsocketReader(HttpReader):
             infer_ms = float(fields[codec.TIMING][str(INFER_MS)])
             seen.infer_ms = infer_ms if isfinite(infer_ms) else None
         traceback = text and not self._in_text  # as openpi sends it
-        seen.error = FAILED * (traceback or kind == codec.ERROR or fields.get(codec.ERROR) is not None)
+        seen.error = FAILED * (traceback or kind == codec.ERROR or isinstance(fields.get(codec.ERROR), (str, dict)))
         if kind == codec.PARTIAL and not seen.error:
             self.piece(seen)
         else:
