@@ -5,23 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
+
+from pydantic import BeforeValidator, Field
 
 from s2a_bench import extras
-from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import GROUPED, FirstVariants, sampling
 from s2a_bench.inference import STAND_IN, EngineConfig, Written
 from s2a_bench.options import Names, Options, group, option
+from s2a_bench.plugins.chunks.latencies import Source, sources, split
 from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
 from s2a_bench.transport import ACTIONS, TRANSPORTS
 
 WITHOUT_PACKAGES: Final = "http/binary"
 """The transport of a control loop, where no transport of actions alone is installed with its packages."""
 
+Sources = Annotated[
+    tuple[str, ...], Field(min_length=1), BeforeValidator(split, json_schema_input_type=tuple[str | float, ...])
+]
+"""Sources of latencies; as text they are separated by commas, and so are the parameters of a family."""
+
 
 def acting_modes(default: tuple[str, ...]) -> Any:
     about = f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas"
-    return option(default, about, first=True, names=lambda: MODES)
+    return option(default, about, first=True, min_length=1, names=lambda: MODES)
 
 
 def acting_over() -> tuple[str, str]:
@@ -63,8 +70,6 @@ class ControlOptions(Options):
         return ControlPlan(self.setting, modes(self.modes, self.setting), self.seed)
 
     def check(self) -> None:
-        if not self.modes:
-            raise UsageError("`modes`: name at least one")
         self.check_modes()
 
     def check_modes(self) -> None:
@@ -74,6 +79,20 @@ class ControlOptions(Options):
     def to_manifest(self) -> dict[str, Any]:
         fields = self.model_dump(mode="json", exclude={"requests"})
         return {**fields, "modes": list(self.control.modes), "period_ns": self.setting.period_ns}
+
+
+class GivenLatencies(ControlOptions):
+    """Robots whose requests take given latencies, in virtual time."""
+
+    virtual: ClassVar[bool] = True
+
+    latency: Sources
+    tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
+
+    @cached_property
+    def sources(self) -> tuple[Source, ...]:
+        tokens = self.horizon * self.tokens_per_action
+        return tuple(source for written in self.latency for source in sources(written, tokens))
 
 
 class LoopRequests(FirstVariants):

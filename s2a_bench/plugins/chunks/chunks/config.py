@@ -6,18 +6,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
-
-from pydantic import BeforeValidator
+from typing import Annotated, Any, Final
 
 from s2a_bench.act import ROBOTS, ActionKind, TaskKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
-from s2a_bench.plugins.chunks.latencies import Source, sources, split
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
-from s2a_bench.plugins.chunks.options import ControlOptions, ServedOptions
+from s2a_bench.plugins.chunks.options import ControlOptions, GivenLatencies, ServedOptions, Sources
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee, fewest
 
 LIVE_RULES: Final = ("calibrated", "tracked", "maximum", "mean")
@@ -27,9 +24,6 @@ PROMISING: Final = ("calibrated", "tracked")
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
 MOST_LIVE_TICKS: Final = 1_000_000
-
-Sources = Annotated[tuple[str, ...], BeforeValidator(split, json_schema_input_type=tuple[str | float, ...])]
-"""Sources of latencies; as text they are separated by commas, and so are the parameters of a family."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +88,8 @@ class ChunksOptions(ControlOptions):
         return {**super().to_manifest(), "live": not self.virtual}
 
 
-class ChunksVirtual(ChunksOptions):
+class ChunksVirtual(ChunksOptions, GivenLatencies):
     """Modes and rules under given latencies."""
-
-    virtual: ClassVar[bool] = True
 
     control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False)
     latency: Sources = option(
@@ -114,13 +106,6 @@ class ChunksVirtual(ChunksOptions):
     calibration_cycles: int = option(
         CALIBRATION, "further requests that the rules learn from; of a recording its first half at most", ge=1
     )
-    tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
-
-    @cached_property
-    def sources(self) -> tuple[Source, ...]:
-        return tuple(
-            each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
-        )
 
     @property
     def rules_tried(self) -> Sequence[str]:
@@ -148,8 +133,6 @@ class ChunksVirtual(ChunksOptions):
 
     def check(self) -> None:
         super().check()
-        if not self.latency:
-            raise UsageError("`latency`: name at least one")
         if self.export_delays is not None and len(self.sources) != 1:
             names = ", ".join(source.name for source in self.sources)
             raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")

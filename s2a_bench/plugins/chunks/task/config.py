@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 from s2a_bench.act import ROBOTS, TaskKind, kind
 from s2a_bench.boards.profile import profile_files
@@ -12,10 +12,15 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import AROUND, DEFAULT_TASK, GROUPED
 from s2a_bench.inference import EngineConfig, check_engine
 from s2a_bench.options import Names, group, option
-from s2a_bench.plugins.chunks.chunks.config import Sources
-from s2a_bench.plugins.chunks.latencies import Source, sources
 from s2a_bench.plugins.chunks.modes import ControlSetting, Rounding, mode
-from s2a_bench.plugins.chunks.options import ControlOptions, LoopRequests, ServedOptions, acting_modes
+from s2a_bench.plugins.chunks.options import (
+    ControlOptions,
+    GivenLatencies,
+    LoopRequests,
+    ServedOptions,
+    Sources,
+    acting_modes,
+)
 
 MOST_STEPS = 1_000_000
 
@@ -61,10 +66,8 @@ class TaskOptions(ControlOptions):
         return {**super().to_manifest(), "live": not self.virtual}
 
 
-class TaskVirtual(TaskOptions):
+class TaskVirtual(TaskOptions, GivenLatencies):
     """Modes under given latencies; the policy is asked in this process."""
-
-    virtual: ClassVar[bool] = True
 
     engine: EngineConfig = group(EngineConfig, only=("name", "action_dim"))
     prompt: str = option(DEFAULT_TASK, "the task in words")
@@ -75,13 +78,6 @@ class TaskVirtual(TaskOptions):
         first=True,
         names=profile_files,
     )
-    tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
-
-    @cached_property
-    def sources(self) -> tuple[Source, ...]:
-        return tuple(
-            each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
-        )
 
     @cached_property
     def policy(self) -> EngineConfig:
@@ -89,8 +85,6 @@ class TaskVirtual(TaskOptions):
 
     def check(self) -> None:
         super().check()
-        if not self.latency:
-            raise UsageError("`latency`: name at least one")
         if "name" not in self.engine.model_fields_set:
             raise UsageError("`engine`: name the policy, as call?function=MODULE:NAME")
         check_engine(self.policy)
