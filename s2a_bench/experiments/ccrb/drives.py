@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeAlias
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns
 from s2a_bench.policy import TOLERANCE_S, Plans, Policy, Schedule
 from s2a_bench.policy.metrics import motion, stalls
-from s2a_bench.scenario import EGO, LEAD, REAR, Simulator, open_simulator
+from s2a_bench.scenario import EGO, ROLES, Simulator, open_simulator
 from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.drive import Driven, Trajectory, drive
 from s2a_bench.scenario.ccrb.ego import PHASES
@@ -28,6 +28,11 @@ from s2a_bench.store.schema import Table
 
 TableRows: TypeAlias = tuple[Table[Any], Iterable[Any]]
 """A table and rows for it."""
+_OF_SCENARIO: Final = (
+    *("follower", "reflex", "lane_change", "front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s"),
+    "follower_survives",
+)
+"""Columns of a roll-out that a scenario has by their names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,26 +105,12 @@ def _rollout(ready: Prepared, simulator: str, policy: str, schedule: Schedule, o
         study="point",
         draw=0,
         policy=policy,
-        board=setting.board,
-        title=setting.title,
-        emulated=setting.emulated,
         simulator=simulator,
-        follower=scenario.follower,
         gap_behaviour=scenario.gap,
-        reflex=scenario.reflex,
-        lane_change=scenario.lane_change,
-        tokens_per_s=setting.tokens_per_s,
-        prompt_s=setting.prompt_s,
-        tokens_per_skill=setting.tokens_per_skill,
-        n_skills=setting.n_skills,
-        t_nom_s=setting.t_nom_s,
         speed_mps=float(scenario.driving.set_point_mps[0, 0]),
         plan_decel_mps2=scenario.decel_mps2,
-        front_gap_m=scenario.front_gap_m,
-        lead_decel_mps2=scenario.lead_decel_mps2,
-        rear_gap_m=scenario.rear_gap_m,
-        reaction_s=scenario.reaction_s,
-        follower_survives=scenario.follower_survives,
+        **{name: value for name, value in asdict(setting).items() if name != "mode"},
+        **{name: getattr(scenario, name) for name in _OF_SCENARIO},
         deadline_ns=to_ns(scenario.deadline_s),
         late=ready.late if policy == TTC else None,
         **metrics,
@@ -153,23 +144,17 @@ def motion_of(path: Trajectory) -> dict[str, Any]:
 
 
 def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    position_m, speed_mps, acceleration_mps2 = (
-        values[:, :, 0].tolist() for values in (path.position_m, path.speed_mps, path.acceleration_mps2)
-    )
+    columns = {
+        f"{role}_{name}": getattr(path, name)[:, car, 0].tolist()
+        for car, role in enumerate(ROLES)
+        for name in ("position_m", "speed_mps", "acceleration_mps2")
+    }
     for step, at_s in enumerate(path.time_s):
         yield TrajectoryRow(
             cell=cell,
             at_ns=to_ns(at_s),
             phase=PHASES[int(path.phase[step, 0])],
             skill=int(path.skill[step, 0]),
-            lead_position_m=position_m[step][LEAD],
-            ego_position_m=position_m[step][EGO],
-            rear_position_m=position_m[step][REAR],
             ego_lateral_m=float(path.lateral_m[step, EGO, 0]),
-            lead_speed_mps=speed_mps[step][LEAD],
-            ego_speed_mps=speed_mps[step][EGO],
-            rear_speed_mps=speed_mps[step][REAR],
-            lead_acceleration_mps2=acceleration_mps2[step][LEAD],
-            ego_acceleration_mps2=acceleration_mps2[step][EGO],
-            rear_acceleration_mps2=acceleration_mps2[step][REAR],
+            **{column: values[step] for column, values in columns.items()},
         )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.timeline.rows import TimelineRow
+from s2a_bench.experiments.cells import COUNT, TIME
+from s2a_bench.experiments.timeline.rows import METRICS, TimelineRow
 from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, to_ns
 from s2a_bench.policy import Plans, Schedule
@@ -44,7 +46,12 @@ def timeline_rows(
     arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
     safe_s = safe_start(arrival_s, nominal_s)
     safe_end_s, least_end_s = safe_s + nominal_s.sum(axis=0), least_end(arrival_s, least_s)
-    of_plan = measure(plans, schedule)
+    of_plan, shared = measure(plans, schedule), asdict(setting)
+    computed = [
+        (metric.column, _STORED.get(metric.kind, share), getattr(of_plan, metric.name))
+        for metric in METRICS.values()
+        if hasattr(of_plan, metric.name)
+    ]
 
     def row(place: int, request_id: str) -> TimelineRow:
         plan = first_plan + place
@@ -52,43 +59,18 @@ def timeline_rows(
         return TimelineRow(
             cell=f"{setting.name}/{policy}",
             policy=policy,
-            board=setting.board,
-            title=setting.title,
-            mode=setting.mode,
-            emulated=setting.emulated,
-            tokens_per_s=setting.tokens_per_s,
-            prompt_s=setting.prompt_s,
-            tokens_per_skill=setting.tokens_per_skill,
-            n_skills=setting.n_skills,
-            t_nom_s=setting.t_nom_s,
+            **shared,
             plan=plan,
             request_id=request_id,
             requested_ns=requested_ns[place] if requested_ns else 0,
             caution=cautions[place] if cautions else None,
             start_ns=to_ns(of_plan.first_action_s[place]),
-            end_ns=to_ns(of_plan.end_s[place]),
             safe_start_ns=to_ns(safe_s[place]),
             last_arrival_ns=to_ns(arrival_s[-1, place]),
             safe_end_ns=to_ns(safe_end_s[place]),
             least_end_ns=to_ns(least_end_s[place]),
-            stalls=int(of_plan.stalls[place]),
             any_stall=bool(of_plan.longest_stall_s[place] > tolerance_s),
-            stall_ns=to_ns(of_plan.stall_s[place]),
-            longest_stall_ns=to_ns(of_plan.longest_stall_s[place]),
-            stall_ratio=share(of_plan.stall_ratio[place]),
-            start_regret=share(of_plan.start_regret[place]),
-            start_regret_elastic=share(of_plan.start_regret_elastic[place]),
-            signed_start_regret=share(of_plan.signed_start_regret[place]),
-            start_regret_of_wait=share(of_plan.start_regret_of_wait[place]),
-            end_regret=share(of_plan.end_regret[place]),
-            end_regret_of_wait=share(of_plan.end_regret_of_wait[place]),
-            end_regret_elastic=share(of_plan.end_regret_elastic[place]),
-            mean_queue_wait_ns=to_ns(of_plan.mean_queue_wait_s[place]),
-            longest_queue_wait_ns=to_ns(of_plan.longest_queue_wait_s[place]),
-            mean_action_age_ns=to_ns(of_plan.mean_action_age_s[place]),
-            oldest_action_ns=to_ns(of_plan.oldest_action_s[place]),
-            speed_distortion=share(of_plan.speed_distortion[place]),
-            fluidity=share(of_plan.fluidity[place]),
+            **{column: stored(values[place]) for column, stored, values in computed},
             **moved,
         )
 
@@ -100,7 +82,11 @@ def share(value: float) -> float:
     return round(float(value), 9) + 0.0
 
 
-def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:
+_STORED: Final[dict[str, Callable[[float], Any]]] = {TIME: to_ns, COUNT: int}
+"""Kind of a metric -> what makes its column of a value; of the others `share`."""
+
+
+def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, Any]:
     """Return the `motion` of one timeline in the model of `speed_profile`; none if it is too long or too short."""
     start_s, duration_s, nominal_s = (
         np.ascontiguousarray(values[:, place]) for values in align(schedule.start_s, schedule.duration_s, nominal_s)

@@ -1,6 +1,7 @@
 """The rows of a timeline run; their annotations are the metrics: columns, JSON, CSV, tables and comparison follow.
 
-A new metric is a column, and its value of a plan in `build_rows.timeline_rows`.
+A new metric is a column, and its values by its name in `policy.metrics`, or that of a plan in
+`build_rows.timeline_rows`.
 """
 
 from __future__ import annotations
