@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator
 from s2a_bench import extras
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.clock import Clock, SystemClock
-from s2a_bench.errors import MissingExtra, UsageError
+from s2a_bench.errors import EngineError, MissingExtra, UsageError
 from s2a_bench.facts import Fact
 from s2a_bench.options import Options, one_of, option
 from s2a_bench.policy.parameters import build
@@ -57,6 +57,7 @@ class Engine(Protocol):
     honours: ClassVar[Sequence[str]] = ()
     """The names in `Request.sampling` that it honours."""
     _facts: dict[str, float] = {}  # noqa: RUF012 - replaced, never changed
+    _closed: bool = False
 
     def __init__(self, config: EngineConfig) -> None:
         """Open the engine; raises EngineError, and UsageError for what `check` refuses."""
@@ -91,9 +92,14 @@ class Engine(Protocol):
         """Return facts for the manifest: engine, model file, hash, whether the weights are dummies."""
         raise NotImplementedError
 
+    def need_open(self) -> None:
+        """Raise EngineError after `close`."""
+        if self._closed:
+            raise EngineError(f"{self.describe()['engine']}: the engine is closed; open a new one")
+
     def close(self) -> None:
         """Free the model; may be called twice."""
-        raise NotImplementedError
+        self._closed = True
 
 
 ENGINES: Final[Registry[type[Engine]]] = Registry(

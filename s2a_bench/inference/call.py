@@ -42,11 +42,9 @@ class CallEngine(Engine):
     def __init__(self, config: EngineConfig) -> None:
         self._name = build(Called, config.name, "engine").function
         self._function = function_of(self._name, "`engine`: call")
-        self._closed = False
 
     def generate(self, request: Request) -> Iterator[Action]:
-        if self._closed:
-            raise EngineError("call: the engine is closed; open a new one")
+        self.need_open()
         if request.max_tokens <= 0:
             return
         try:
@@ -65,6 +63,3 @@ class CallEngine(Engine):
 
     def describe(self) -> dict[str, str | int | float | bool]:
         return {"engine": "call", "model": self._name, "grammar": "ignored"}
-
-    def close(self) -> None:
-        self._closed = True

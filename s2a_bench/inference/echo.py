@@ -11,7 +11,7 @@ from itertools import cycle, islice
 
 from s2a_bench.boards.latency import read_latency, sequence_ns
 from s2a_bench.clock import Clock, SystemClock
-from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.errors import UsageError
 from s2a_bench.facts import LATENCY_DRAWN_MS, Fact
 from s2a_bench.inference import Engine, EngineConfig, chunk
 from s2a_bench.types import Piece, Request, Token
@@ -54,11 +54,9 @@ class EchoEngine(Engine):
         self._config = config
         self._clock = clock or SystemClock()
         self._latencies_ns = _sequence_ns(config) if config.latency else None
-        self._closed = False
 
     def generate(self, request: Request) -> Iterator[Piece]:
-        if self._closed:
-            raise EngineError("echo: the engine is closed; open a new one")
+        self.need_open()
         if self._latencies_ns is not None:
             started_ns, latency_ns = self._clock.now_ns(), next(self._latencies_ns)
             self._facts = {LATENCY_DRAWN_MS: latency_ns / 1e6}
@@ -74,6 +72,3 @@ class EchoEngine(Engine):
         facts: dict[str, str | int | float | bool] = {"engine": self._config.name, "model": "none", "dummy": True}
         facts |= {"emulated": True, "latency": self._config.latency} if self._config.latency else {}
         return facts | ({"answer": self._config.pieces} if self._config.chunks else {})
-
-    def close(self) -> None:
-        self._closed = True

@@ -59,7 +59,6 @@ class OneThreadEngine(Engine):
     """Calls an engine on a separate thread, or on another engine's ``thread``."""
 
     def __init__(self, make: Callable[[], Engine], thread: ThreadPoolExecutor | None = None) -> None:
-        self._closed = False
         self._answer = _Answer()
         self._thread = thread or ThreadPoolExecutor(1, "engine")
         self._shares = thread is not None

@@ -15,7 +15,7 @@ import numpy as np
 from s2a_bench.boards.gaps import Constant, Gaps, Lognormal, Recorded, to_table
 from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.clock import Clock, SystemClock
-from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.errors import UsageError
 from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS
 from s2a_bench.inference import Engine, EngineConfig, chunk
 from s2a_bench.text import none_of
@@ -77,11 +77,9 @@ class ReplayEngine(Engine):
         self._clock = clock or SystemClock()
         self._requests = 0
         self._played = 0
-        self._closed = False
 
     def generate(self, request: Request) -> Iterator[Piece]:
-        if self._closed:
-            raise EngineError("replay: the engine is closed; open a new one")
+        self.need_open()
         if request.max_tokens <= 0:
             return
         started_ns = self._clock.now_ns()
@@ -135,9 +133,6 @@ class ReplayEngine(Engine):
             "grammar": "ignored",
             **({"answer": self._config.pieces} if self._config.chunks else {}),
         }
-
-    def close(self) -> None:
-        self._closed = True
 
 
 def _plan(seed: int) -> Iterator[str]:
