@@ -93,9 +93,9 @@ def required(title: str, provenance: str) -> str:
     return provenance
 
 
-def number(value: float) -> str:
-    """Format a time in ms, or a ratio, with three digits and at most three decimals."""
-    return f"{value:.{_decimals(value)}f}"
+def number(value: float | None, scale: float = 1) -> str:
+    """Format a time in ms, or a ratio, times ``scale``, with three digits and at most three decimals."""
+    return ABSENT if value is None else f"{value * scale:.{_decimals(value * scale)}f}"
 
 
 def mean_sd(summary: Summary) -> str:

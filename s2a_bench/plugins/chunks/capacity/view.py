@@ -18,7 +18,7 @@ from s2a_bench.stats.batches import Rows
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.json import frame
-from s2a_bench.writers.tables import ABSENT, TextTable, number
+from s2a_bench.writers.tables import TextTable, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,10 +114,7 @@ def _entry(metric: Metric, fleet: FleetRow) -> str:
 
 
 def _value(metric: Metric, value: float | None) -> str:
-    if value is None:
-        return ABSENT
-    factor = {TIME: 1e3, SHARE: 100}.get(metric.kind, 1)
-    return number(value * factor)
+    return number(value, {TIME: 1e3, SHARE: 100}.get(metric.kind, 1))
 
 
 def build_capacity(fleets: Sequence[FleetRow], knees: Sequence[KneeRow]) -> Figure:

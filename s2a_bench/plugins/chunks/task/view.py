@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Final
 
@@ -58,7 +58,8 @@ def task_sentences(cells: Sequence[TaskCell], margin: float) -> Iterator[str]:
             if (cell.slower or 0) > 1:
                 yield f"{mode} at {cell.source} is not judged: the world was slower than the wall clock."
             elif cell.fixed_s is None:
-                yield f"{mode} at {cell.source}, {_ms(cell.latency_s)} ms: {share(cell)} of {cell.episodes} succeed."
+                mean_ms = number(cell.latency_s, 1e3)
+                yield f"{mode} at {cell.source}, {mean_ms} ms: {share(cell)} of {cell.episodes} succeed."
 
 
 def borne(judged: Sequence[TaskCell], margin: float) -> str:
@@ -91,7 +92,7 @@ def task_table(cells: Sequence[TaskCell], robot: dict[str, str], margin: float, 
         "time: to a success.",
     )
     header = ("mode", "latency", "L (ms)", "n", "success, %", "95 %", "lost, %", "time (s)")
-    return _table("What delay costs the task", header, cells, _entries, notes)
+    return _table("What delay costs the task", header, cells, map(_entries, cells), notes)
 
 
 def _entries(cell: TaskCell) -> tuple[str, ...]:
@@ -100,12 +101,12 @@ def _entries(cell: TaskCell) -> tuple[str, ...]:
         lost = f"{cell.lost * 100:.0f} [{cell.lost_low * 100:.0f}, {cell.lost_high * 100:.0f}]"
     interval = f"[{cell.success_low * 100:.0f}, {cell.success_high * 100:.0f}]"
     return (
-        _ms(cell.latency_s),
+        number(cell.latency_s, 1e3),
         str(cell.episodes),
         f"{cell.success * 100:.0f}",
         interval,
         lost,
-        ABSENT if cell.duration_s is None else number(cell.duration_s),
+        number(cell.duration_s),
     )
 
 
@@ -113,12 +114,8 @@ def motion_table(cells: Sequence[TaskCell]) -> TextTable:
     shown = [name for name in MOTION if any(getattr(cell, name) is not None for cell in cells)]
     declared = metrics_of(EpisodeRow)
     note = " ".join(f"{declared[name].title}: {declared[name].about}" for name in shown)
-
-    def entries(cell: TaskCell) -> tuple[str, ...]:
-        values = (getattr(cell, name) for name in shown)
-        return tuple(ABSENT if value is None else number(value) for value in values)
-
     header = ("mode", "latency", *(declared[name].title for name in shown))
+    entries = [[number(getattr(cell, name)) for name in shown] for cell in cells]
     return _table("How the task was done", header, cells, entries, (note,))
 
 
@@ -126,16 +123,12 @@ def _table(
     title: str,
     header: Sequence[str],
     cells: Sequence[TaskCell],
-    entries: Callable[[TaskCell], tuple[str, ...]],
+    entries: Iterable[Iterable[str]],
     notes: Sequence[str],
 ) -> TextTable:
-    groups = groupby(cells, lambda cell: cell.mode)
-    rows = [[(cell.mode, cell.source, *entries(cell)) for cell in of_mode] for _, of_mode in groups]
-    return TextTable.grouped(title, header, rows, 2, notes, once=1, cells=[cell.cell for cell in cells])
-
-
-def _ms(seconds: float | None) -> str:
-    return ABSENT if seconds is None else number(seconds * 1e3)
+    rows = [(cell.mode, cell.source, *texts) for cell, texts in zip(cells, entries, strict=True)]
+    groups = (group for _, group in groupby(rows, lambda row: row[0]))
+    return TextTable.grouped(title, header, groups, 2, notes, once=1, cells=[cell.cell for cell in cells])
 
 
 def build_task(cells: Sequence[TaskCell], settings: dict[str, Any]) -> Figure:

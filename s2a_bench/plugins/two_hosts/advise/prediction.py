@@ -240,7 +240,7 @@ def advice_table(advices: Sequence[Advice], config: AdviseConfig, profile: LinkP
     columns |= {"bound ms": [number(each.bound_ms) for each in advices], "limited by": [each.limit for each in advices]}
     if config.rate:
         columns["of the rate"] = [f"{each.load:.0%}" for each in advices]
-        columns["wait ms"] = [ABSENT if each.wait_ms is None else number(each.wait_ms) for each in advices]
+        columns["wait ms"] = [number(each.wait_ms) for each in advices]
     if config.deadline or config.rate:
         columns["meets it"] = [{True: "yes", False: "no", None: "unclear"}[each.meets] for each in advices]
     notes = (

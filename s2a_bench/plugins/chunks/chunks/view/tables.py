@@ -103,7 +103,7 @@ def delay_table(cells: ChunkCells) -> TextTable:
     for place, group in enumerate(cells.sources.values(), 1):
         for row in group if cells.live else group[:1]:
             about = (str(getattr(row, column)) for column in left)
-            latency = (number(row.latency_s * 1e3), number(row.latency_s_p99 * 1e3))
+            latency = (number(row.latency_s, 1e3), number(row.latency_s_p99, 1e3))
             named.append(row.cell)
             rows.append((str(place), *about, *latency, *(_entry(row, name) for name in names)))
     header = ("L", *left, "ms", "p99", *(_TITLES[name] for name in names))
