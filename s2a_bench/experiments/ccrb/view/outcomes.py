@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, RolloutRow
 from s2a_bench.experiments.cells import Cells
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.policy.conformal import interval
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import NAIVE, PAPER, STREAM_TO_ACT, WAIT, follower_check, law
 from s2a_bench.store.requests import SKILLS, TOKENS, SkillRow
@@ -33,10 +34,7 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float]:
-        from scipy.stats import binomtest
-
-        interval = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
-        return float(interval.low), float(interval.high)
+        return interval(self.k, self.n)
 
 
 @dataclass(frozen=True)
