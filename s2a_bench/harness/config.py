@@ -55,6 +55,8 @@ else:  # a group of options for each transport; options that only `serve` has ar
 
 
 class SentConfig(Options):
+    PANEL: ClassVar[str] = "Pictures"
+
     transports: Names = option(
         COMPARED,
         f"{', '.join(dict(TRANSPORTS.loaded()))}; several with commas, with /VARIANT and ?OPTION=VALUE: "
@@ -64,28 +66,16 @@ class SentConfig(Options):
         first=True,
         names=paths,
     )
-    source: str = option(
-        "synthetic",
-        f"{', '.join(SOURCES)}, as video:FILE",
-        panel="Pictures",
-        names=lambda: SOURCES,
-    )
-    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]", panel="Pictures", first=True)
-    cameras: int = option(
-        1, "pictures a request, read one after the other from the source", ge=1, le=16, panel="Pictures"
-    )
+    source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE", names=lambda: SOURCES)
+    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]", first=True)
+    cameras: int = option(1, "pictures a request, read one after the other from the source", ge=1, le=16)
     resize: Square | None = option(
-        None,
-        "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they are sent [default: as captured]",
-        panel="Pictures",
+        None, "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they are sent [default: as captured]"
     )
-    state: int = option(
-        0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096, panel="Pictures"
-    )
+    state: int = option(0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096)
     payload: Payloads = option(
         (),
         f"how pictures are sent: {', '.join(PAYLOADS)}; several with commas, each in cells of its own [default: raw]",
-        panel="Pictures",
         first=True,
     )
     options: TransportOptions = group(TransportOptions, first=())
