@@ -31,22 +31,8 @@ from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester
 
 if TYPE_CHECKING:
-    from s2a_bench.act import ActionKind
-    from s2a_bench.plugins.chunks.chunks.config import ChunksLive, RulesPlan
-    from s2a_bench.plugins.chunks.options import ControlPlan
+    from s2a_bench.plugins.chunks.chunks.config import ChunksLive
     from s2a_bench.progress import Progress
-
-
-@dataclass(frozen=True, slots=True)
-class ActingPlan:
-    """How every cell acts."""
-
-    control: ControlPlan
-    rules: RulesPlan
-    seconds: float
-    latency: str
-    """Given to the server; empty: it answers as fast as it can."""
-    robot: ActionKind | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,9 +108,8 @@ def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
     plan = resolve(config.robots_requests, progress.say)
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")
-    loop = ActingPlan(control, config.rules_plan, config.seconds, config.latency, config.robot_kind)
     several = any(each.several for each in control.modes.values())
-    task = Task("chunks", drive=partial(_drive, loop), clients=CLIENTS if several else 1)
+    task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
         rows = delay_rows(next(measured(folder)), np.empty(0, np.int64), mode, config.setting)
@@ -132,32 +117,32 @@ def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
     return folder
 
 
-def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
-    blocks, control = count(), plan.control
+def _drive(config: ChunksLive, launch: RunningLaunch) -> None:
+    blocks, control, rules, kind = count(), config.control, config.rules_plan, config.robot_kind
     tried: list[tuple[ActingCell, list[Session], int]] = []
     launch.progress.stage("warming up")
     for name, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
         sessions = list(of_cell)
         learnt, dims = warm_up(control.setting, launch, sessions, blocks)
-        drawn = LatencyDraw(Source(f"{name}, {plan.latency}" if plan.latency else name), learnt[:0], learnt)
-        tried += [(cell, sessions, dims) for cell in cells(control, plan.rules, drawn)]
+        drawn = LatencyDraw(Source(f"{name}, {config.latency}" if config.latency else name), learnt[:0], learnt)
+        tried += [(cell, sessions, dims) for cell in cells(control, rules, drawn)]
     calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
     launch.writer.update(calibrations=calibrations)
     launch.warnings.extend(exchange_warnings(calibrations, FOLLOW))
     launch.progress.expect(len(tried))
     for cell, sessions, dims in Random(control.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
-        launch.progress.stage(f"acting for {plan.seconds:g} s: {cell.cell}")
+        launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
         setting = control.setting.slowed(cell.slower)
-        robot = plan.robot.open_actions(dims, setting.period_ns) if plan.robot else None
+        robot = kind.open_actions(dims, setting.period_ns) if kind else None
         with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
-            ticks = max(2, round(plan.seconds * 1e9 / setting.period_ns))
+            ticks = max(2, round(config.seconds * 1e9 / setting.period_ns))
             acting, requester = act(cell.acting, setting, sessions, launch, blocks, ticks=ticks, robot=robot)
             live = LiveResult(cell, setting, acting.acted(), requester, tuple(acting.stepper.triggers))
             acted = live.actions()
             keep_origin(launch.writer, cell.cell, sessions[0].origin)
             whole = acted.ticks.chunk.size  # what is measured is kept
-            for table, rows in cell_rows(acted, whole, plan.rules.epsilon, control.seed).items():
+            for table, rows in cell_rows(acted, whole, rules.epsilon, control.seed).items():
                 launch.writer.append(table, rows)
         if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, acted.cell.drawn)):
             launch.warnings.extend(changed)
