@@ -158,16 +158,12 @@ class SweepRun:
             self._writer.update(machines={host: outcome.machine})
         row = CellRow(
             cell=cell.name,
-            repeat=cell.repeat,
+            **{name: getattr(cell, name) for name in ("repeat", "virtual", "board", "settings", "config_hash")},
             attempt=attempt,
             state="failed" if error else "finished",
             error=error,
-            virtual=cell.virtual,
-            board=cell.board,
             host=host,
-            settings=cell.settings,
             argv=list(cell.argv),
-            config_hash=cell.config_hash,
             folder=str(kept.relative_to(self._writer.path)) if run is not None else "",
             started=outcome.started,
             wall_s=outcome.wall_s,

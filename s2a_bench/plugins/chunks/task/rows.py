@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.bounds import Count, Fraction, Many, NonNegative, about
@@ -45,7 +45,7 @@ COMPARED: Final = Comparable.of(EPISODES, ("p_success", "reward"), ("mode", "lat
 
 
 def episode_row(
-    names: Mapping[str, str], seed: int, acted: Acted, period_ns: int, outcome: Outcome, *, live: bool
+    names: Mapping[str, Any], seed: int, acted: Acted, period_ns: int, outcome: Outcome, *, live: bool
 ) -> EpisodeRow:
     """Return the row of an episode; ``names`` are its cell, mode and latency."""
     latency_ns = acted.arrival_ns[: acted.whole, -1]
@@ -55,14 +55,11 @@ def episode_row(
         **names,
         seed=seed,
         latency_s=float(latency_ns.mean() / 1e9) if latency_ns.size else None,
-        success=outcome.success,
-        reward=outcome.reward,
         duration_s=acted.chunk.size * period_ns / 1e9,
         ticks=int(acted.chunk.size),
         stall_ticks=int((~chosen[chosen.argmax() :]).sum()) if chosen.any() else 0,
         age_ticks=float(age.mean()) if age.size else None,
-        path=outcome.path,
-        jerk=outcome.jerk,
+        **asdict(outcome),
         slower=float(acted.busy_ns.mean() / period_ns) if live else None,
     )
 
