@@ -12,7 +12,7 @@ from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes, draw
-from s2a_bench.plugins.chunks.chunks.config import PROMISING, RulesPlan
+from s2a_bench.plugins.chunks.chunks.config import PROMISING
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
 from s2a_bench.provenance import Origins, Provenance
@@ -22,7 +22,6 @@ from s2a_bench.store.run import RunWriter
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
     from s2a_bench.plugins.chunks.modes import ControlSetting
-    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.progress import Progress
 
 MOST_TICKS: Final = 100_000_000
@@ -31,15 +30,11 @@ MOST_TICKS: Final = 100_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualPlan:
-    """A run in virtual time."""
+    """What is drawn for a run in virtual time, and what follows."""
 
-    control: ControlPlan
-    rules: RulesPlan
     drawn: Sequence[LatencyDraw]
     """Of each source."""
     cells: Sequence[ActingCell]
-    shown_ticks: int
-    export_delays: Path | None
     manifest: dict[str, Any]
 
 
@@ -70,7 +65,7 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),
     }
-    return VirtualPlan(control, rules, drawn, tried, config.shown_ticks, config.export_delays, manifest)
+    return VirtualPlan(drawn, tried, manifest)
 
 
 def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
@@ -86,25 +81,21 @@ def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
     """Act in virtual time and return the run folder; raises S2AError."""
     plan = resolve(config)
-    setting, mode, first = plan.control.setting, plan.rules.mode, plan.drawn[0]
+    setting, mode, first = config.control.setting, config.rules_plan.mode, plan.drawn[0]
     with RunWriter.create(output, "chunks", plan.manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
         progress.expect(len(plan.cells))
         for cell in plan.cells:
-            acted = _acted(cell, setting.slowed(cell.slower))
-            for table, rows in cell_rows(acted, plan.shown_ticks, plan.rules.epsilon, plan.control.seed).items():
+            acting, latency_ns, slowed = cell.acting, cell.drawn.judged, setting.slowed(cell.slower)
+            acted = ActedCell(cell, slowed, acting.cycles(latency_ns, slowed), acting.ticks(latency_ns, slowed))
+            for table, rows in cell_rows(acted, config.shown_ticks, config.epsilon, config.seed).items():
                 writer.append(table, rows)
             progress.advance()
         if mode is not None:
             for drawn in plan.drawn:
                 writer.append(TRIGGERS, trigger_rows(mode, setting, drawn))
-        writer.append(MEANS, mean_rows(plan.control, first))
-        if plan.export_delays is not None:
-            write_delays(plan.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
+        writer.append(MEANS, mean_rows(config.control, first))
+        if config.export_delays is not None:
+            write_delays(config.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
         return writer.path
-
-
-def _acted(cell: ActingCell, setting: ControlSetting) -> ActedCell:
-    mode, latency_ns = cell.acting, cell.drawn.judged
-    return ActedCell(cell, setting, mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting))
