@@ -7,20 +7,18 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_type_hints
 
-from s2a_bench.stats import Summary, summary_of
-from s2a_bench.store.schema import PROVENANCE, Row, kinds_of
+from s2a_bench.stats import Floats, Summary, summary_of
+from s2a_bench.store.schema import PROVENANCE, Kind, Row, Table, kinds_of
+from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.tables import TextTable, entries
 
 if TYPE_CHECKING:
     import pandas as pd
     from typing_extensions import Self
 
     from s2a_bench.provenance import Origins
-    from s2a_bench.stats import Floats
     from s2a_bench.stats.batches import Rows
     from s2a_bench.store.run import StoredRun
-    from s2a_bench.store.schema import Kind, Table
-    from s2a_bench.writers.csv_text import CsvTable
-    from s2a_bench.writers.tables import TextTable
 
 TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
 Better: TypeAlias = Literal["lower", "higher", "neither"]
@@ -209,14 +207,10 @@ class Cells(Generic[Row]):
 
     def csv(self, columns: Sequence[str] = ()) -> CsvTable:
         """Return the rows, or some of their columns, each with its provenance."""
-        from s2a_bench.writers.csv_text import CsvTable
-
         return CsvTable.of_frame(self.frame[[*columns, PROVENANCE]] if columns else self.frame)
 
     def table(self, title: str, metrics: Sequence[str] = (), notes: Sequence[str] = ()) -> TextTable:
         """Return a table with a line a cell: the number of its rows, and each metric's statistic."""
-        from s2a_bench.writers.tables import TextTable, entries
-
         shown = [self.metrics[name] for name in metrics or self.metrics]
         cells = self.split().items()
         rows = [

@@ -37,6 +37,7 @@ from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN, Provenance
 from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.stats.batches import Blocks, Rows
+from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
@@ -563,8 +564,6 @@ def ratio_between(cell: RequestCell, base: RequestCell, metric: str, seed: int) 
     """
     if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
         return None
-    from s2a_bench.stats.change import ratio_of_launches
-
     return ratio_of_launches(cell.by_launch(metric), base.by_launch(metric), seed)
 
 

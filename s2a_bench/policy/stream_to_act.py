@@ -28,16 +28,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
+import numpy as np
 from pydantic import Field
 
 from s2a_bench.policy import CAUTION, Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
+from s2a_bench.policy.changes import ChangeWatch
 from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
 from s2a_bench.policy.nominal import Clairvoyant
-
-if TYPE_CHECKING:
-    from s2a_bench.policy.changes import ChangeWatch
 
 FAVOURABLE = 2.0
 """Standard deviations by which a favourable forecast is earlier than the mean."""
@@ -84,8 +83,6 @@ class StreamToAct(Policy):
         return schedule(self.prior, self._lambda, plans, self.rule)
 
     def schedules(self, plans: Plans, cautions: Sequence[float]) -> Schedule:
-        import numpy as np
-
         from s2a_bench.policy.conformal import take
         from s2a_bench.policy.online import schedule
 
@@ -103,11 +100,7 @@ class StreamToAct(Policy):
         return Clairvoyant()
 
     def stepper(self, shape: PlanShape) -> Stepper:
-        watch = None
-        if self.detect:
-            from s2a_bench.policy.changes import ChangeWatch
-
-            watch = ChangeWatch(self.prior)
+        watch = ChangeWatch(self.prior) if self.detect else None
         return OnlineStepper(self.prior, self._lambda, shape, self.rule, watch)
 
     @property

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from s2a_bench.experiments.references import REFERENCES, Reference
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.tables import TextTable
-
-if TYPE_CHECKING:
-    from s2a_bench.store.run import StoredRun
 
 
 class Met(NamedTuple):

@@ -11,18 +11,16 @@ from functools import cache
 from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar, cast
 
 from s2a_bench import extras
 from s2a_bench import options as base
 from s2a_bench.errors import UsageError
+from s2a_bench.facts import Fact
 from s2a_bench.registry import Registry
+from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import LIMITS, Bounds, Limits
-
-if TYPE_CHECKING:
-    from s2a_bench.facts import Fact
-    from s2a_bench.trace import Trace
-    from s2a_bench.types import Frame, Piece, Request
+from s2a_bench.types import Frame, Piece, Request
 
 PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
 """Forms of a picture, in the order of tables: BGR pixels, the camera's YUYV, JPEG, JPEG encoded before the run, PNG."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from s2a_bench.bounds import Many, NonNegative
 from s2a_bench.stats import Ratio
 from s2a_bench.store.manifest import present
+from s2a_bench.store.run import StoredRun
 from s2a_bench.store.schema import SCHEMA
-
-if TYPE_CHECKING:
-    from s2a_bench.store.run import StoredRun
-    from s2a_bench.store.sweep import Sweep
+from s2a_bench.store.sweep import Sweep
 
 
 @dataclass(frozen=True, slots=True)

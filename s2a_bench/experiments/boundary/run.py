@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +18,10 @@ from s2a_bench.policy.arrivals import fragments, tokens
 from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import work_conserving
+from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
-
-if TYPE_CHECKING:
-    from s2a_bench.progress import Progress
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from s2a_bench.act.events import AbortRequested, Event, LiveInbox, PlanFeed, SkillArrived
 from s2a_bench.act.record import Record, observed
@@ -34,6 +34,7 @@ from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, PromptPlan, 
 from s2a_bench.harness.timelines.policies import prepare
 from s2a_bench.plan import Parser, load_skills
 from s2a_bench.policy import PlanShape, Policy
+from s2a_bench.progress import Progress
 from s2a_bench.ros import messages as ros
 from s2a_bench.scenario import ROLES, Simulator, open_simulator, simulator_class
 from s2a_bench.scenario.ccrb.drive import place
@@ -41,9 +42,6 @@ from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ros import with_ego
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.types import Frame
-
-if TYPE_CHECKING:
-    from s2a_bench.progress import Progress
 
 STEP_S: Final = 0.02
 """Step on the clock of a world without physics of its own."""

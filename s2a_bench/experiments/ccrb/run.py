@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed, CcrbModelled
 from s2a_bench.experiments.ccrb.drives import Prepared, complete, loop_rows, point_rows
@@ -19,6 +19,7 @@ from s2a_bench.harness.timelines.policies import certain, draw
 from s2a_bench.harness.timelines.rows import token_rows
 from s2a_bench.machine import environment
 from s2a_bench.policy import PlanShape
+from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import open_simulator
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -27,10 +28,6 @@ from s2a_bench.scenario.ccrb.studies import draw as draw_scenes
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
-
-if TYPE_CHECKING:
-    from s2a_bench.progress import Progress
-
 
 _BOARD: Final = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 from s2a_bench.bounds import Count, Facts, about
 from s2a_bench.experiments.requests import (
@@ -22,14 +22,11 @@ from s2a_bench.experiments.requests import (
     summarised_by,
     summary_rows,
 )
-from s2a_bench.stats import Summary, SummaryEnds
+from s2a_bench.stats import Ratio, Summary, SummaryEnds
 from s2a_bench.trace import GROUPS
 from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry
-
-if TYPE_CHECKING:
-    from s2a_bench.stats import Ratio
 
 AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metrics")))
 """What is known of a request by what surrounds its run, after the metrics of `LatencyCell`."""

@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,10 +28,8 @@ from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.environment import board_facts
 from s2a_bench.machine.tuning import limit_threads
+from s2a_bench.progress import Progress
 from s2a_bench.types import Request
-
-if TYPE_CHECKING:
-    from s2a_bench.progress import Progress
 
 _MODEL_FACTS = (
     "name",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,13 +12,10 @@ from s2a_bench.experiments.cells import COUNT, TIME
 from s2a_bench.experiments.timeline.rows import METRICS, TimelineRow
 from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, to_ns
-from s2a_bench.policy import Plans, Schedule
+from s2a_bench.policy import Floats, Plans, Schedule
 from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import measure, motion, speed_profile
 from s2a_bench.policy.schedule import align, least_end, safe_start
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
 
 SAMPLE_S: Final = 0.01
 SHORTEST_MOTION_S: Final = 1e-9

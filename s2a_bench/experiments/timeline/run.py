@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.act.events import Requested, SkillArrived, StreamEnded, TokenArrived
 from s2a_bench.act.executor import SILENCE_S
@@ -26,7 +26,7 @@ from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Skill
-from s2a_bench.policy import Plans
+from s2a_bench.policy import Floats, Plans
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.progress import Progress, watching
 from s2a_bench.provenance import Origins, Provenance
@@ -35,9 +35,6 @@ from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.store.schema import Table
 from s2a_bench.types import Timing
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
 
 TABLES: Final = (TIMELINES, SKILLS, TOKENS)
 

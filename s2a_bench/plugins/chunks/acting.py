@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from s2a_bench.act import TaskRobot
+from s2a_bench.act import ActionRobot, TaskRobot
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.harness.rounds import RunningLaunch
@@ -17,9 +17,6 @@ from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Ints, Mode, mode
 from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
 from s2a_bench.types import Frame, Pixels, Vector
-
-if TYPE_CHECKING:
-    from s2a_bench.act import ActionRobot
 
 CLIENTS: Final = 4
 """Of a cell, for modes with several concurrent requests."""

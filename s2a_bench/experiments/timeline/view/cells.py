@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from s2a_bench.experiments.cells import Cells, Comparable, Subject, json_of
 from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES, TimelineRow
+from s2a_bench.policy import Floats
 from s2a_bench.provenance import Origins
 from s2a_bench.store.requests import SKILLS, TOKENS, SkillRow
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
-    from s2a_bench.store.run import StoredRun
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import COUNT, FLAG, SHARE, TIME, Metric
@@ -22,11 +22,9 @@ from s2a_bench.experiments.timeline.view.cells import (
 from s2a_bench.experiments.timeline.view.figures import page_lanes, timeline_figures
 from s2a_bench.policy import ONLINE
 from s2a_bench.policy.conformal import promise, upper_bound
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
-
-if TYPE_CHECKING:
-    from s2a_bench.store.run import StoredRun
 
 
 def show(run: StoredRun, **_: Any) -> Shown:

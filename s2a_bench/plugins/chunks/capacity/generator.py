@@ -13,39 +13,36 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import count
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 from threading import Event, Lock, Thread
 from time import monotonic, process_time
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import ServerDied, UsageError
+from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import RequestFeed
+from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import UNKNOWN_ORIGIN, Measured, Place, RequestContext, Session
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import allowed, end_with_parent, keep_large_blocks, limit_threads
+from s2a_bench.plugins.chunks.capacity.config import RobotLoad
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
+from s2a_bench.plugins.chunks.modes import Mode
 from s2a_bench.plugins.chunks.modes.cycles import gather
 from s2a_bench.plugins.chunks.requester import SEEDS, ChunkRequester, Job, wait_s
+from s2a_bench.provenance import Provenance
 from s2a_bench.transport import TRANSPORTS, Wiring, open_client
 from s2a_bench.transport.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-
-    from s2a_bench.frames import FrameSource
-    from s2a_bench.harness.plan import RunPlan
-    from s2a_bench.plugins.chunks.capacity.config import RobotLoad
-    from s2a_bench.plugins.chunks.modes import Mode
-    from s2a_bench.provenance import Provenance
-    from s2a_bench.types import Frame, Piece
+from s2a_bench.types import Frame, Piece
 
 STRIDE: Final = 1 << 20
 """Between the numbers of two requests of a robot, so that those of different robots differ."""

@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.experiments.cells import Metric, mean, metrics_of, share
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Flags, Ints, Ticks
-
+from s2a_bench.plugins.chunks.modes import ControlSetting, Flags, Ints, Ticks
 
 BLOCKS: Final = 5
 """Of time, between which stalls vary; long against the queue's memory."""

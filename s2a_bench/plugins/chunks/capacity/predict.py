@@ -10,27 +10,24 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from s2a_bench.boards.latency import STRETCH, read_delays
 from s2a_bench.errors import UsageError
 from s2a_bench.machine import environment
-from s2a_bench.plugins.chunks.capacity.config import RobotLoad, SearchPlan
+from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted, RobotLoad, SearchPlan
 from s2a_bench.plugins.chunks.capacity.metrics import measures
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, FleetRow, KneeRow
 from s2a_bench.plugins.chunks.capacity.search import Judge, Tried, knee, search
 from s2a_bench.plugins.chunks.capacity.simulate import UNKNOWN, ServiceTime, simulate
 from s2a_bench.plugins.chunks.latencies import Source, sources
+from s2a_bench.plugins.chunks.modes import Ints
+from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
-    from s2a_bench.plugins.chunks.modes import Ints
-    from s2a_bench.progress import Progress
 
 SEEDS: Final = 5
 """Of a predicted knee."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
@@ -18,7 +18,7 @@ from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import STAND_IN
 from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.resources import POWER_W
-from s2a_bench.plugins.chunks.capacity.config import RobotLoad, SearchPlan
+from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured, RobotLoad, SearchPlan
 from s2a_bench.plugins.chunks.capacity.generator import STRIDE, Fleet, FleetOnRay, FleetPlan, FleetProcess
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
 from s2a_bench.plugins.chunks.capacity.predict import Prediction, Service
@@ -36,15 +36,12 @@ from s2a_bench.plugins.chunks.capacity.rows import (
     Source,
 )
 from s2a_bench.plugins.chunks.capacity.search import Judge, Tried, knee, search
+from s2a_bench.progress import Progress
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.transport import EXTERNAL, PROGRAM, Choice
 from s2a_bench.transport.defaults import LOOPBACK
 from s2a_bench.transport.pipeline import Pipeline, pipelines
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured
-    from s2a_bench.progress import Progress
 
 ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
 ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("chat_template", ""), ("gpu_layers", 0))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from s2a_bench.experiments.cells import COUNT
-from s2a_bench.plugins.chunks.chunks.cells import without_trigger
+from s2a_bench.plugins.chunks.chunks.cells import ActingCell, LatencyDraw, without_trigger
 from s2a_bench.plugins.chunks.chunks.rows import (
     CHUNKS,
     METRICS,
@@ -24,17 +24,14 @@ from s2a_bench.plugins.chunks.chunks.rows import (
     TickRow,
     TriggerRow,
 )
+from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Mode, Ticks
 from s2a_bench.plugins.chunks.modes.closed import beta, closed
 from s2a_bench.plugins.chunks.modes.metrics import greatest, margin_ticks, mean, measure, p99, reaction_ticks
+from s2a_bench.plugins.chunks.options import ControlPlan
+from s2a_bench.policy import Floats
 from s2a_bench.policy.conformal import interval
 from s2a_bench.stats.seeds import generator
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.cells import ActingCell, LatencyDraw
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Mode, Ticks
-    from s2a_bench.plugins.chunks.options import ControlPlan
-    from s2a_bench.policy import Floats
-    from s2a_bench.store.schema import Table
+from s2a_bench.store.schema import Table
 
 EVENTS: Final = 100_000
 """Random events whose reaction times are measured."""

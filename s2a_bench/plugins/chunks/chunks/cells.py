@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from s2a_bench.harness.warnings import change_warnings
 from s2a_bench.plugins.chunks.chunks.config import CYCLES, RulesPlan
+from s2a_bench.plugins.chunks.latencies import Source
+from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
 from s2a_bench.plugins.chunks.modes.trigger import (
     Learning,
     Maximum,
@@ -21,17 +23,12 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     greatest_trigger,
     trigger,
 )
-from s2a_bench.policy.conformal import Tracker
+from s2a_bench.plugins.chunks.options import ControlPlan
+from s2a_bench.policy.conformal import Calibration, Tracker
 from s2a_bench.policy.parameters import canonical
 from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.seeds import generator
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.latencies import Source
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
-    from s2a_bench.plugins.chunks.options import ControlPlan
-    from s2a_bench.policy.conformal import Calibration
-    from s2a_bench.store.manifest import RunWarning
+from s2a_bench.store.manifest import RunWarning
 
 GIVEN: Final = "given"
 FOLLOW: Final = "take --rules tracked, whose trigger follows the delays"

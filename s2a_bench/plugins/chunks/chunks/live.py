@@ -11,7 +11,7 @@ from functools import partial
 from itertools import count, groupby
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +23,13 @@ from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stall_metrics, stalls_of
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes
-from s2a_bench.plugins.chunks.chunks.config import PROMISING
+from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksLive
 from s2a_bench.plugins.chunks.control import Acted
 from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
 from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.config import ChunksLive
-    from s2a_bench.progress import Progress
+from s2a_bench.progress import Progress
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes, draw
-from s2a_bench.plugins.chunks.chunks.config import PROMISING
+from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
+from s2a_bench.plugins.chunks.modes import ControlSetting
+from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
-    from s2a_bench.plugins.chunks.modes import ControlSetting
-    from s2a_bench.progress import Progress
 
 MOST_TICKS: Final = 100_000_000
 """Control ticks of a cell, which are held in memory."""

@@ -7,19 +7,16 @@ from functools import partial
 from itertools import count, groupby, product
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING
 
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
+from s2a_bench.plugins.chunks.options import ControlPlan
+from s2a_bench.plugins.chunks.task.config import TaskLive
 from s2a_bench.plugins.chunks.task.rows import EPISODES, episode_row
+from s2a_bench.progress import Progress
 from s2a_bench.store.manifest import RunWarning
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.options import ControlPlan
-    from s2a_bench.plugins.chunks.task.config import TaskLive
-    from s2a_bench.progress import Progress
 
 
 def run_live(config: TaskLive, output: Path, progress: Progress) -> Path:

@@ -12,32 +12,28 @@ from functools import cache
 from itertools import product
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from s2a_bench.act import TaskKind, TaskRobot
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import RobotError
-from s2a_bench.inference import EngineConfig, open_engine
+from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import limit_threads, obey_parent
 from s2a_bench.plugins.chunks.acting import frame_of
 from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks
+from s2a_bench.plugins.chunks.latencies import Source
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
 from s2a_bench.plugins.chunks.modes.cycles import arrivals
 from s2a_bench.plugins.chunks.requester import SEEDS, check_length
+from s2a_bench.plugins.chunks.task.config import TaskVirtual
 from s2a_bench.plugins.chunks.task.rows import EPISODES, EpisodeRow, episode_row
+from s2a_bench.progress import Progress
 from s2a_bench.provenance import NONE, Origins, Provenance
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
 from s2a_bench.types import Action, Request, Vector
-
-if TYPE_CHECKING:
-    from s2a_bench.act import TaskKind, TaskRobot
-    from s2a_bench.inference import Engine
-    from s2a_bench.plugins.chunks.latencies import Source
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
-    from s2a_bench.plugins.chunks.task.config import TaskVirtual
-    from s2a_bench.progress import Progress
 
 DRAWN = 256
 """Latencies that are drawn together."""

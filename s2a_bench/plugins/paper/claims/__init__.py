@@ -9,14 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 from s2a_bench.provenance import Origins, Provenance, joined
 from s2a_bench.report.verdicts import ClaimVerdict, Evidence, Met
 from s2a_bench.stats import Ratio
-
-if TYPE_CHECKING:
-    from s2a_bench.store.run import StoredRun
+from s2a_bench.store.run import StoredRun
 
 SUPPORTED: Final = "supported"
 REPRODUCED: Final = "reproduced at the chosen point"

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import Cells, json_of
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, ChunkRow
 from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, CellTicks, chunk_figures, colour_of, lanes_of
 from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells, chunk_tables, entry
+from s2a_bench.provenance import Origins
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
 from s2a_bench.writers.tables import number
-
-if TYPE_CHECKING:
-    from s2a_bench.provenance import Origins
-    from s2a_bench.store.run import StoredRun
 
 BARS: Final = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.experiments import Tables
 from s2a_bench.experiments.cells import SHARE, Cells
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, ChunkRow
 from s2a_bench.policy.conformal import promise
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
-
-if TYPE_CHECKING:
-    from s2a_bench.store.run import StoredRun
 
 CONVENTION: Final = {
     "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
