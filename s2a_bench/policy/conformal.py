@@ -27,15 +27,14 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import option
 from s2a_bench.policy import Floats, Plans, Policy, Schedule
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 EPSILON: Final = 0.01
 """Share of plans that may stall."""
@@ -131,8 +130,6 @@ def no_promise(calibrations: Mapping[str, Mapping[str, Any]]) -> str:
 
 def scores(policy: Policy, plans: Plans) -> Floats:
     """Return each plan's score, shape (M,): the least caution of GRID from which on it has no stall, else infinity."""
-    import numpy as np
-
     count = plans.arrival_s.shape[1]
     score = np.full(count, GRID[0])
     left = np.arange(count)
@@ -187,8 +184,6 @@ def choose(
 
     ``delay`` has the delay behind each score, such as a plan's last arrival, in order of measurement.
     """
-    import numpy as np
-
     from s2a_bench.stats.batches import lag_one
 
     count = score.size
@@ -273,8 +268,6 @@ class TrackedPolicy:
 
         Blocks of plans are decided at every lambda in one pass; then lambda is chosen plan by plan.
         """
-        import numpy as np
-
         chosen, starts, durations = [], [], []
         count = plans.arrival_s.shape[1]
         for places in np.array_split(np.arange(count), -(-count // AT_ONCE)):
@@ -293,8 +286,6 @@ class TrackedPolicy:
 
 def _least(stalls: NDArray[np.bool_]) -> list[float]:
     """Return each plan's score: the least lambda from which on it does not stall."""
-    import numpy as np
-
     above = len(CAUTIONS) - np.argmax(stalls[::-1], axis=0)
     ranks = np.where(stalls.any(axis=0), above, 0)
     return [CAUTIONS[min(rank, len(CAUTIONS) - 1)] for rank in ranks]
@@ -314,8 +305,6 @@ def interval(seen: float, of: float) -> tuple[float, float]:
 
 def stalled(schedule: Schedule) -> NDArray[np.bool_]:
     """Return a mask of the plans with any stall, shape (M,)."""
-    import numpy as np
-
     from s2a_bench.policy.metrics import stalls
 
     return np.asarray((stalls(schedule) > ANY_STALL_S).any(axis=0))

@@ -6,17 +6,15 @@ Arrays hold M roll-outs in lock step; `LEAD`, `EGO` and `REAR` index the cars. S
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol
+from typing import ClassVar, Final, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from s2a_bench.frames import FrameSource
 from s2a_bench.policy import Floats
 from s2a_bench.policy.parameters import build
 from s2a_bench.registry import Registry
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from s2a_bench.frames import FrameSource
 
 LEAD, EGO, REAR = 0, 1, 2
 ROLES: Final = ("lead", "ego", "rear")

@@ -7,14 +7,13 @@ Euro NCAP's test protocol for AEB car-to-car: both cars at 50 km/h, 12 or 40 m a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.plan.skillset import Gap
 from s2a_bench.policy import Floats, Plans, Schedule
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import ArrayLike, NDArray
 
 KMH: Final = 1 / 3.6
 NCAP_SPEED_MPS: Final = 50 * KMH
@@ -73,8 +72,6 @@ def braking_plan(
     With ``lane_change`` one more skill follows at the last speed; the default of a_p is then half as large, which
     leaves speed for the lane change.
     """
-    import numpy as np
-
     speed, nominal = np.broadcast_arrays(np.atleast_1d(np.asarray(cars.speed_mps, float)), np.asarray(t_nom_s, float))
     decel = plan_decel(cars, n_skills, nominal, lane_change=lane_change) if decel_mps2 is None else decel_mps2
     steps = np.arange(n_skills + 1.0)[:, np.newaxis]
@@ -87,8 +84,6 @@ def braking_plan(
 
 def plan_decel(cars: Cars, n_skills: int, t_nom_s: ArrayLike, *, lane_change: bool = False) -> Floats:
     """Return the default a_p in m/s^2: v0 / (N T), half of it before a lane change."""
-    import numpy as np
-
     decel: Floats = np.asarray(cars.speed_mps, float) / (n_skills * np.asarray(t_nom_s, float))
     return decel / 2 if lane_change else decel
 
@@ -101,8 +96,6 @@ def start_deadline(cars: Cars, plan_decel_mps2: ArrayLike) -> Floats:
     The lead's jerk, which adds time, and the ego's lag, which takes time, are left out. A negative value means that
     no start keeps the distance.
     """
-    import numpy as np
-
     distance, lead, speed, plan = np.broadcast_arrays(
         np.maximum(np.asarray(cars.front_gap_m, float) - SAFETY_M, 0.0),
         np.asarray(cars.lead_decel_mps2, float),
@@ -124,8 +117,6 @@ def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> tuple[Schedule, NDArray[np
     on up to T_max, and the roll-out is late, as the mask says: safety goes before smoothness. All arrivals are known;
     ``deadline_s`` is one number, or of shape (M,).
     """
-    import numpy as np
-
     from s2a_bench.policy.schedule import align, safe_start, work_conserving
 
     arrival_s, nominal_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.most_s)

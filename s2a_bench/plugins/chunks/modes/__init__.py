@@ -27,19 +27,19 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from s2a_bench.errors import UsageError
+from s2a_bench.policy import Floats
 from s2a_bench.policy.parameters import build, canonical
 from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from s2a_bench.plugins.chunks.modes.closed import Closed
-    from s2a_bench.policy import Floats
 
-Ints: TypeAlias = "NDArray[np.int64]"
-Flags: TypeAlias = "NDArray[np.bool_]"
+Ints: TypeAlias = NDArray[np.int64]
+Flags: TypeAlias = NDArray[np.bool_]
 Rounding: TypeAlias = Literal["floor", "ceil"]
 """floor: an action leaves at the end of its tick, so a chunk that arrives within it is in time (Real-time chunking,
 arXiv 2506.07339). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L is a multiple of
