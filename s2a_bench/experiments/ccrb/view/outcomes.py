@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pandas as pd
 
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, RolloutRow
 from s2a_bench.experiments.cells import Cells
@@ -13,12 +15,8 @@ from s2a_bench.policy.conformal import interval
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import NAIVE, PAPER, STREAM_TO_ACT, WAIT, follower_check, law
 from s2a_bench.store.requests import SKILLS, TOKENS, SkillRow
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from s2a_bench.store.run import StoredRun
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+
+import pandas as pd
 
 from s2a_bench.experiments import Shown, requests
 from s2a_bench.experiments.ccrb.rows import METRICS, RolloutRow
@@ -13,16 +16,10 @@ from s2a_bench.experiments.ccrb.view.outcomes import Rollouts, Share, origin_not
 from s2a_bench.experiments.cells import json_of
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import NO_SCORE, ORDERING, law, operating_point
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    import pandas as pd
-
-    from s2a_bench.store.run import StoredRun
 
 OUTCOME: Final = ("start_s", "stalls", "stall_s", "impact_speed_mps", "min_front_gap_m", "min_rear_gap_m")
 LOOP: Final = ("real_time_factor", "tracking_rms_mps")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pandas as pd
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.columns import NS_PER_MS, known
@@ -23,14 +25,10 @@ from s2a_bench.experiments.requests import (
     span_of,
 )
 from s2a_bench.stats import Floats, Ratio, summary_of
+from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from s2a_bench.store.run import StoredRun
 
 _STAGE_CELLS = 5
 """With more cells than this a narrow table has the cells as rows."""
