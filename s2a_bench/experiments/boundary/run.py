@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -22,18 +22,6 @@ from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
-
-
-@dataclass(frozen=True, slots=True)
-class NaiveTrial:
-    """The plans that naive execution runs at every point: how long and how many their skills are, how tokens come."""
-
-    duration: Duration
-    duration_s: float
-    n_skills: int
-    jitter: str
-    plans: int
-    seed: int
 
 
 def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Path:
@@ -55,40 +43,41 @@ def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Pa
     with RunWriter.create(output, "boundary", manifest, (BOUNDARY,)) as writer:
         progress.opened(writer.path)
         progress.stage("trying every point")
-        durations_s: Mapping[Duration, float] = {"t_nom": config.t_nom_s, "t_min": config.t_min * config.t_nom_s}
-        for name, duration_s in durations_s.items():
-            trial = NaiveTrial(name, duration_s, config.n_skills, config.jitter, config.plans_a_point, config.seed)
-            writer.append(BOUNDARY, rows(trial, lengths, rates))
+        for duration in get_args(Duration):
+            writer.append(BOUNDARY, rows(config, duration, lengths, rates))
             for board in boards:
-                writer.append(BOUNDARY, rows(trial, config.tokens_per_skill, [board.tokens_per_s], board.name))
+                at_board = rows(config, duration, config.tokens_per_skill, [board.tokens_per_s], board.name)
+                writer.append(BOUNDARY, at_board)
         return writer.path
 
 
 def rows(
-    trial: NaiveTrial, tokens_per_skill: Sequence[int], rates: Sequence[float], board: str = ""
+    config: BoundaryConfig, duration: Duration, lengths: Sequence[int], rates: Sequence[float], board: str = ""
 ) -> Iterator[BoundaryRow]:
-    """Yield formula and trial at every pair of L and R; one set of draws serves all, so that none differs by chance.
+    """Yield formula and trial of naive at every pair of L and R; one set of draws serves all: none differs by chance.
 
     Naive is stall-free iff S0 = t_1: for even tokens and equal durations T if L / R <= T, the paper's figure 2. The
     paper draws that line for T_min, but naive runs skills at T_nom. The prompt's time shifts all arrivals equally.
     """
-    durations_s = np.full((trial.n_skills, 1), trial.duration_s)
-    gaps, count = gaps_of(trial.jitter, 1.0), max(tokens_per_skill) * trial.n_skills
-    token_s = tokens(gaps, 0.0, count, trial.plans, generator(trial.seed, "boundary", board))
-    for length in tokens_per_skill:
-        unit_s = fragments(token_s[: length * trial.n_skills], length)
+    n_skills, plans, jitter = config.n_skills, config.plans_a_point, config.jitter
+    duration_s = config.t_nom_s if duration == "t_nom" else config.t_min * config.t_nom_s
+    durations_s = np.full((n_skills, 1), duration_s)
+    drawn = generator(config.seed, "boundary", board)
+    token_s = tokens(gaps_of(jitter, 1.0), 0.0, max(lengths) * n_skills, plans, drawn)
+    for length in lengths:
+        unit_s = fragments(token_s[: length * n_skills], length)
         for rate in rates:
             arrival_s = unit_s / rate
             naive = Schedule(work_conserving(arrival_s, durations_s, arrival_s[0]), durations_s)
             yield BoundaryRow(
-                duration=trial.duration,
-                duration_s=trial.duration_s,
+                duration=duration,
+                duration_s=duration_s,
                 tokens_per_skill=length,
                 tokens_per_s=rate,
                 board=board,
-                n_skills=trial.n_skills,
-                family=trial.jitter,
-                plans=trial.plans,
-                stall_free=length / trial.duration_s <= rate,
+                n_skills=n_skills,
+                family=jitter,
+                plans=plans,
+                stall_free=length / duration_s <= rate,
                 p_stall=float((stalls(naive) > ANY_STALL_S).any(axis=0).mean()),
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import pytest
@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.experiments.boundary.config import BoundaryConfig
-from s2a_bench.experiments.boundary.rows import BOUNDARY
-from s2a_bench.experiments.boundary.run import NaiveTrial, rows, run_boundary
+from s2a_bench.experiments.boundary.rows import BOUNDARY, Duration
+from s2a_bench.experiments.boundary.run import rows, run_boundary
 from s2a_bench.experiments.boundary.view import disagreements, show
 from s2a_bench.experiments.cells import Cells
 from s2a_bench.policy import Plans, policy
@@ -27,8 +27,8 @@ from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from tests.conftest import examples
 
-T_NOM = NaiveTrial("t_nom", 1.0, n_skills=8, jitter="none", plans=1, seed=0)
-T_MIN = replace(T_NOM, duration="t_min", duration_s=0.8)
+EVEN = BoundaryConfig()
+DURATIONS: Final[tuple[Duration, ...]] = ("t_min", "t_nom")
 
 
 @pytest.fixture(scope="module")
@@ -58,29 +58,29 @@ def drawn(run: StoredRun) -> Figure:
 def test_formula_and_trial_agree_without_jitter(
     n_skills: int, t_nom_s: float, t_min: float, low: float, factor: float
 ) -> None:
-    for duration, duration_s in (("t_nom", t_nom_s), ("t_min", t_min * t_nom_s)):
-        trial = NaiveTrial(duration, duration_s, n_skills, "none", plans=1, seed=0)
-        for row in rows(trial, range(1, 8), np.geomspace(low, low * factor, 15).tolist()):
+    config = BoundaryConfig(n_skills=n_skills, t_nom_s=t_nom_s, t_min=t_min)
+    for duration in DURATIONS:
+        for row in rows(config, duration, range(1, 8), np.geomspace(low, low * factor, 15).tolist()):
             close = abs(row.tokens_per_skill / row.tokens_per_s - row.duration_s) < 1e-5  # a stall too short to be one
             assert close or row.stall_free == (row.p_stall == 0)
 
 
 def test_the_line_is_tokens_over_duration() -> None:
-    found = rows(T_MIN, (2, 4), (2.49, 2.5, 4.99, 5.0))
+    found = rows(EVEN, "t_min", (2, 4), (2.49, 2.5, 4.99, 5.0))
     assert [row.stall_free for row in found] == [False, True, True, True, False, False, False, True]
 
 
 def test_the_papers_line_leaves_out_what_runs_smoothly_at_nominal_durations() -> None:
     rates = np.geomspace(0.3, 60.0, 25).tolist()
-    papers, true = ([row.stall_free for row in rows(trial, range(1, 9), rates)] for trial in (T_MIN, T_NOM))
+    papers, true = ([row.stall_free for row in rows(EVEN, duration, range(1, 9), rates)] for duration in DURATIONS)
     assert all(nominal >= paper for paper, nominal in zip(papers, true, strict=True))
-    papers, true = (next(rows(trial, (4,), (4.8,))).stall_free for trial in (T_MIN, T_NOM))
+    papers, true = (next(rows(EVEN, duration, (4,), (4.8,))).stall_free for duration in DURATIONS)
     assert (papers, true) == (False, True)  # 4 tokens at 4.8 tokens/s: 0.83 s a skill
 
 
 def shares(seed: int = 1) -> list[float]:
-    trial = replace(T_NOM, jitter="lognormal:cv=0.5", plans=400, seed=seed)
-    return [row.p_stall for row in rows(trial, (1, 4, 6), (0.58, 4.8, 34.2))]
+    config = BoundaryConfig(jitter="lognormal:cv=0.5", plans=400, seed=seed)
+    return [row.p_stall for row in rows(config, "t_nom", (1, 4, 6), (0.58, 4.8, 34.2))]
 
 
 def test_a_seed_makes_the_simulation_repeat_itself() -> None:
