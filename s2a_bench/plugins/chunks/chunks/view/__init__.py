@@ -10,7 +10,6 @@ from s2a_bench.experiments.cells import Cells, json_of
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, ChunkRow
 from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, CellTicks, chunk_figures, colour_of, lanes_of
 from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells, chunk_tables, entry
-from s2a_bench.provenance import Origins
 from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
@@ -28,13 +27,11 @@ def show(run: StoredRun, **_: Any) -> Shown:
         main=["chunks", "loop"],
         csvs=lambda: {"chunks.csv": Cells.of(run, CHUNKS).csv()},
         figures=lambda: chunk_figures(run, cells, lanes),
-        json=lambda: frame(run, [_json(row, run.origins) for row in cells.rows], []),
+        json=lambda: frame(
+            run, [json_of(row) | {"emulated": run.origins.of(row.cell).emulated} for row in cells.rows], []
+        ),
         lanes=lambda: page_lanes(lanes),
     )
-
-
-def _json(row: ChunkRow, origins: Origins) -> dict[str, Any]:
-    return {**json_of(row), "emulated": origins.of(row.cell).emulated}
 
 
 def chunk_sentences(cells: ChunkCells) -> list[str]:
