@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from rich.console import Group
 from rich.text import Text
 
+from s2a_bench.act.record import Record
 from s2a_bench.clock import now_ns
 from s2a_bench.policy import TOLERANCE_S
-
-if TYPE_CHECKING:
-    from s2a_bench.act.record import Record
 
 STATUS = 21
 LEAST_LANE = 20

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from s2a_bench.store.run import StoredRun
 from s2a_bench.text import dotted
-
-if TYPE_CHECKING:
-    from s2a_bench.store.run import StoredRun
 
 _KIND: Final = ("cpu", "machine", "board", "cores")
 _MACHINE: Final = (*_KIND, "affinity", "governor", "power_mode")

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from s2a_bench.plugins.chunks.capacity.config import Limit
 from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics, RobotTrace, cycle_ns, share_interval
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.capacity.config import Limit
-    from s2a_bench.plugins.chunks.capacity.rows import Verdict
-    from s2a_bench.plugins.chunks.modes import Ints
+from s2a_bench.plugins.chunks.capacity.rows import Verdict
+from s2a_bench.plugins.chunks.modes import Ints
 
 
 @dataclass(frozen=True, slots=True)

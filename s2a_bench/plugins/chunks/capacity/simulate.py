@@ -10,16 +10,14 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from s2a_bench.plugins.chunks.capacity.config import RobotLoad
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Pace, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import drive
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.capacity.config import RobotLoad
 
 UNKNOWN: Final = -1
 
