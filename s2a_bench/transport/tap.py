@@ -154,35 +154,58 @@ class Incoming:
     """The bytes of one direction for a parser that is a generator: ``yield from incoming.read(n)`` waits for them."""
 
     def __init__(self, parser: Callable[[Incoming], Generator[None, None, None]]) -> None:
-        self._bytes = bytearray()
+        self._pieces: list[bytes] = []
+        self._at = self._there = self._unwanted = 0
+        """Bytes of the first piece that were read, those there to read, and those to come that are unwanted."""
         self._parser = parser(self)
         next(self._parser)
 
     def feed(self, data: bytes) -> None:
-        self._bytes += data
+        if self._unwanted > len(data):
+            self._unwanted -= len(data)
+            return
+        data, self._unwanted = data[self._unwanted :], 0
+        self._pieces.append(data)
+        self._there += len(data)
         next(self._parser)
 
     def begin(self) -> Generator[None, None, int]:
         """Wait for a byte, and return it; it stays to be read."""
-        while not self._bytes:
+        while not self._there:
             yield
-        return self._bytes[0]
+        return self._joined()[self._at]
 
     def read(self, size: int) -> Generator[None, None, bytes]:
         if size > MOST_BYTES:
             raise ValueError(f"a message of {size} bytes, more than {MOST_BYTES}")
-        while len(self._bytes) < size:
+        while self._there < size:
             yield
-        data = bytes(memoryview(self._bytes)[:size])
-        del self._bytes[:size]
-        return data
+        whole, at = self._joined(), self._at
+        self._drop(size)
+        return whole[at : at + size]
 
     def skip(self, size: int) -> Generator[None, None, None]:
         """Drop bytes as they come."""
-        while size:
-            yield from self.begin()
-            size -= (here := min(size, len(self._bytes)))
-            del self._bytes[:here]
+        there = min(size, self._there)
+        self._drop(there)
+        self._unwanted = size - there
+        while self._unwanted:
+            yield
+
+    def _joined(self) -> bytes:
+        """Join what is there, without a copy if it came together."""
+        if len(self._pieces) > 1:
+            first, *others = self._pieces
+            self._pieces, self._at = [b"".join((memoryview(first)[self._at :], *others))], 0
+        return self._pieces[0] if self._pieces else b""
+
+    def _drop(self, size: int) -> None:
+        self._there -= size
+        if self._there:
+            self._joined()
+            self._at += size
+        else:
+            self._pieces, self._at = [], 0
 
 
 class ParsedTapReader(TapReader):
