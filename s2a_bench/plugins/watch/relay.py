@@ -40,7 +40,7 @@ class Totals:
     unreachable: int = 0
     """Connections for which the server was not there."""
     unread: int = 0
-    """Connections that were read by turns, as their reader failed."""
+    """Connections read by turns, as their reader failed."""
     pings: int = 0
 
 
@@ -68,7 +68,7 @@ class ByteRelay:
         self._connections = Connections(self.listener, self._handle, LIMITS.connections, b"")
 
     def serve(self) -> None:
-        """ByteRelay until `stop`; then connections are ended, and what passed is read to its end."""
+        """Relay until `stop`; then connections are ended, and what passed is read to its end."""
         self._connections.serve()
         for server, thread in list(self._joined.items()):
             with suppress(OSError):

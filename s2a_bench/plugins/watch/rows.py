@@ -81,7 +81,7 @@ class Before:
 
 @dataclass(slots=True)
 class SeenCycles:
-    """TurnsReader what was seen into rows, client by client."""
+    """Turns what was seen into rows, client by client."""
 
     tick_ns: float = 0.0
     """Of the robot's control loop; 0: not known."""
@@ -91,8 +91,9 @@ class SeenCycles:
         before = self._before.setdefault((client, seen.what), Before())
         sent_ns, first_ns = seen.sent_ns or seen.request_ns, first_of(seen)
         infer_ns = None if seen.infer_ms is None else round(seen.infer_ms * 1e6)
-        if infer_ns is not None and not 0 <= infer_ns <= first_ns - sent_ns:
-            infer_ns = None  # it is no part of this time
+        longest_ns = (first_ns - sent_ns) if seen.pieces_ns else (seen.end_ns - seen.request_ns)
+        if infer_ns is not None:  # else it is of something else
+            infer_ns = min(infer_ns, first_ns - sent_ns) if 0 <= infer_ns <= longest_ns else None
         good = not seen.error and bool(seen.end_ns)
         row = ExchangeRow(
             cell=seen.what,

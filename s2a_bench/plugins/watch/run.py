@@ -43,7 +43,7 @@ SWITCH_S: Final = 5e-5
 
 @dataclass(slots=True)
 class Watch:
-    """A run that keeps what it is told: `report` may be called from any thread, `keep` writes."""
+    """A run that keeps what is reported: `report` may be called from any thread, all else on the main one."""
 
     config: WatchOptions
     writer: RunWriter
@@ -75,12 +75,12 @@ class Watch:
         self.progress.stage("watching; Ctrl-C ends it")
         ends_ns = now_ns() + round(self.config.seconds * 1e9)
         with suppress(KeyboardInterrupt), watching(self.progress, self.view):
-            while not ((self.config.seconds and now_ns() >= ends_ns) or self._kept >= self.config.requests > 0):
+            while not (self._full or (self.config.seconds and now_ns() >= ends_ns)):
                 with suppress(Empty):
                     self._keep(*self._reported.get(timeout=POLL_S))
 
     def keep_rest(self) -> int:
-        """Write what was told since, and return how many exchanges there were."""
+        """Write what was reported since, and return how many exchanges there were."""
         while not (self._reported.empty() or self._full):
             self._keep(*self._reported.get())
         return self._kept
@@ -115,10 +115,10 @@ def opened(
 
 
 def run_tap(config: WatchTap, output: Path, progress: Progress) -> Path:
-    """ByteRelay until the end and return the run folder; raises S2AError, also if no exchange was seen."""
+    """Relay until the end and return the run folder; raises S2AError, also if no exchange was seen."""
     transport = config.transport
     transport.check_machine()
-    reader = resolve_name(transport.reader or "s2a_bench.transport.tap:TurnsReader")
+    reader = resolve_name(transport.reader)
     origin = Provenance(tokens=AT_TAP, link="real" if is_local(config.server[0]) else UNKNOWN)
     with config.bound() as listener, opened(config, output, progress, transport.name, origin) as watch:
         relay = ByteRelay(listener, config.server, reader, watch.report, progress.say)

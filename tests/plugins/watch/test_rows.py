@@ -34,9 +34,16 @@ def test_the_parts_of_a_cycle_add_up_to_the_period() -> None:
     assert (second.inference_ns, second.age_ns) == (None, 13 * MS)
 
 
-@pytest.mark.parametrize("infer_ms", [-1.0, 1e300, 11.0])
+@pytest.mark.parametrize("infer_ms", [-1.0, 1e300, 14.0])
 def test_what_a_server_says_of_another_time_is_left_out(infer_ms: float) -> None:
     (row,) = rows(SeenCycles(), seen(0.001, infer_ms=infer_ms))
+    assert (row.server_ns, row.inference_ns) == (10 * MS, None)
+
+
+def test_a_server_may_have_begun_before_the_tap_knew_that_it_had_sent_all() -> None:
+    (row,) = rows(SeenCycles(), seen(1, infer_ms=10.1))
+    assert (row.server_ns, row.inference_ns) == (0, 10 * MS)
+    (row,) = rows(SeenCycles(), seen(1, infer_ms=10.1, pieces_ns=[12 * MS, 13 * MS]))
     assert (row.server_ns, row.inference_ns) == (10 * MS, None)
 
 
