@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = "s2a_bench"
 BESIDE = ("studies", "tools", "benchmarks", "tests")
-BUDGETS = {"s2a_bench": 55_930, "core": 40_680, "tests": 48_630}
+BUDGETS = {"s2a_bench": 57_830, "core": 41_010, "tests": 51_220}
 """Lines: of the product, of its core, and of the tests."""
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

@@ -106,7 +106,7 @@ def router(answers: Callable[[bytes], Sequence[bytes]]) -> Iterator[int]:
     """A ROUTER: its port. Each request gets so many answers; none ends it."""
     context, over = zmq.Context(), Event()
     peer = context.socket(zmq.ROUTER)
-    peer.rcvtimeo, peer.linger, peer.heartbeat_ivl = 20, 0, 30
+    peer.rcvtimeo, peer.linger, peer.heartbeat_ivl, peer.heartbeat_timeout = 20, 0, 30, 20_000
     port = peer.bind_to_random_port("tcp://127.0.0.1")
 
     def serve() -> None:
@@ -192,7 +192,7 @@ def test_requests_of_a_req_socket_are_told_whose_first_of_a_kind_is_decoded() ->
 
 
 def test_a_dealers_envelope_is_counted_and_heartbeats_are_no_answers() -> None:
-    *_, pings = session(zmq.DEALER, heartbeat_ivl=20)
+    *_, pings = session(zmq.DEALER, heartbeat_ivl=20, heartbeat_timeout=20_000)
     assert pings > 0
 
 

@@ -17,7 +17,6 @@ from websockets.frames import CTRL_OPCODES, Frame, Opcode
 from s2a_bench.errors import RequestFailed
 from s2a_bench.facts import INFER_MS
 from s2a_bench.plugins.policy_servers.websocket import codec
-from s2a_bench.transport.http.dialects.decoder import ODD
 from s2a_bench.transport.http.tap import WHOLE_BYTES, HttpReader, chunk_of, loaded
 from s2a_bench.transport.tap import FAILED, MOST_BYTES, Incoming, Seen
 
@@ -88,7 +87,7 @@ class WebsocketReader(HttpReader):
         if chunk := chunk_of(answer):
             before = seen.chunk[0] if kind == codec.PARTIAL and seen.chunk else 0
             seen.chunk = before + chunk[0], chunk[1]
-        with suppress(*ODD):
+        with suppress(KeyError, TypeError, ValueError):
             infer_ms = float(fields[codec.TIMING][str(INFER_MS)])
             seen.infer_ms = infer_ms if isfinite(infer_ms) else None
         traceback = text and not self._in_text  # as openpi sends it
