@@ -102,7 +102,7 @@ def test_a_foreign_client_and_server_and_its_traceback() -> None:
             assert "Traceback" in peer.recv()
         seen = tap_.after(2)
     assert [each.chunk for each in seen] == [(10, 7), None]
-    assert [each.error for each in seen] == ["", "ValueError: no such task"]
+    assert [each.error for each in seen] == ["", FAILED]
 
 
 def test_pages_and_a_refused_handshake_are_exchanges_of_http(monkeypatch: pytest.MonkeyPatch) -> None:
