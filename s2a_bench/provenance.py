@@ -39,8 +39,8 @@ class Provenance:
 
     ``weights`` are real, dummy, or none without a model; emulated tokens have none, or the dummy ones of their profile.
     ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution), paced (held back), or
-    one of `SEEN`;
-    ``link`` real (within this machine), emulated after ``link_profile``, or none; ``clock`` monotonic or virtual.
+    one of `SEEN`: seen at the tap, seen at the topics, recorded. ``link`` real (within this machine), emulated after
+    ``link_profile``, or none; ``clock`` monotonic, virtual or log time.
     ``profile`` names the emulated profile or latencies. ``pictures`` are "not seen" by a text model, "not seen or
     sent" where its server refuses them; else empty. A field that nothing reported is "unknown", as the link to another
     machine is.

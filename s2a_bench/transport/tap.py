@@ -13,6 +13,8 @@ from typing import Any, Final
 
 MOST_BYTES: Final = 64 << 20
 """Of a message that is decoded."""
+DECODED_BYTES: Final = 4 << 20
+"""Of an answer in one piece that is decoded."""
 MOST_WAITING: Final = 1000
 """Requests of a connection that wait for their answers."""
 MOST_KINDS: Final = 32
@@ -23,7 +25,7 @@ MOST_PIECES: Final = 1 << 20
 LETTERS: Final = 100
 """Of kinds of exchanges."""
 FAILED: Final = "an error in place of an answer"
-"""What an error becomes: what a server says may have a key in it, or what the robot was told."""
+"""What an error becomes: what a server says may have a key or the robot's prompt in it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -103,7 +105,7 @@ class TapReader:
             seen.sent_ns = self.to_ns
 
     def begin_answer(self) -> Seen | None:
-        """Return the exchange whose answer these bytes belong to, None for bytes that nobody asked for."""
+        """Return the exchange whose answer these bytes belong to, None for bytes without a request."""
         if not self._waiting:
             return None
         seen = self._waiting[0]

@@ -401,7 +401,7 @@ def test_a_head_that_does_not_end_is_given_up(start: bytes, up: bool) -> None:
 
 
 def test_a_stream_without_a_message_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tap, "WHOLE_BYTES", 1000)
+    monkeypatch.setattr(tap, "DECODED_BYTES", 1000)
     body = b"data: " + b"x" * 2000 + b"\n\n" + sse(delta(content="a"))
     parts = [(UP, post(CHAT, b"{}")), (DOWN, whole(body, kind="text/event-stream"))]
     (seen,) = fed(HttpReader, parts, 100)

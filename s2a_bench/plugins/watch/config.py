@@ -53,7 +53,9 @@ class WatchTap(WatchOptions):
         pattern=r"^(.+:)?\d+$",
         first=True,
     )
-    no_auth: bool = option(False, "listen beyond this machine: whoever reaches the tap reaches the server", first=True)
+    no_auth: bool = option(
+        False, "listen beyond this machine: every host that reaches the tap reaches the server", first=True
+    )
 
     @field_validator("to")
     @classmethod

@@ -26,7 +26,7 @@ class Pairs:
 
     They pair by stamp if one of the first `UNDECIDED` answers has that of an observation, else by order: then an answer
     belongs to the newest observation before it.
-    Several answers to an observation are pieces of one; it is told of when another one is answered, and at the end.
+    Several answers to an observation are pieces of one; it is reported when another one is answered, and at the end.
     """
 
     def __init__(self, what: str, report: Callable[[Seen], None], *, stamped: bool) -> None:

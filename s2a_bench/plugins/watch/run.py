@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 from queue import Empty, Full, Queue
@@ -54,7 +53,6 @@ class Watch:
     """Exchanges that came faster than rows can be written."""
     _reported: Queue[tuple[int, Seen]] = field(default_factory=lambda: Queue(MOST_REPORTED))
     _cycles: SeenCycles = field(default_factory=SeenCycles)
-    _numbers: Iterator[int] = field(default_factory=count)
     _kept: int = 0
 
     def __post_init__(self) -> None:
@@ -86,11 +84,11 @@ class Watch:
         return self._kept
 
     def _keep(self, client: int, seen: Seen) -> None:
-        number, row = next(self._numbers), self._cycles.row(client, seen)
+        number, row = self._kept, self._cycles.row(client, seen)
+        self._kept += 1
         self.writer.append(EXCHANGES, [row])
         self.writer.sample(sample_of(row, seen, number, self.transport))
         self.writer.tokens(tokens_of(row, seen, number))
-        self._kept += 1
         self.view.rows.append(row)
         if seen.observation is not None:
             with suppress(RecursionError):

@@ -1,6 +1,6 @@
 """HTTP/1.1 as a tap sees it: httptools finds requests and answers, the dialects read what is in them.
 
-Sizes are those of bodies. Compressed answers, and what does not come within `WHOLE_BYTES`, are not read; an answer
+Sizes are those of bodies. Compressed answers, and what does not come within `DECODED_BYTES`, are not read; an answer
 without a length ends with its connection.
 """
 
@@ -23,11 +23,9 @@ from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.decoder import ODD, Decoder
 from s2a_bench.transport.http.dialects.framing import Framing, JsonLines, ServerSentEvents, WholeBody
 from s2a_bench.transport.http.dialects.openai import METRICS
-from s2a_bench.transport.tap import FAILED, LETTERS, MOST_BYTES, Seen, TapReader
+from s2a_bench.transport.tap import DECODED_BYTES, FAILED, LETTERS, MOST_BYTES, Seen, TapReader
 from s2a_bench.vectors import actions_of
 
-WHOLE_BYTES: Final = 4 << 20
-"""Of an answer in one piece that is decoded."""
 HEAD_BYTES: Final = 1 << 20
 PLAIN: Final = re.compile(r"[A-Za-z._-]{0,40}\d{0,2}|v\d\w*")
 """A part of a path that is kept: others may be names of users, or keys."""
@@ -92,7 +90,7 @@ class SeenAnswer:
         self._unread += len(data)
         for event in self._decoder.feed(data) if self._decoder else ():
             self._learn(event)
-        if self._unread > WHOLE_BYTES:
+        if self._unread > DECODED_BYTES:
             self._decoder = None
 
     def end(self) -> None:

@@ -246,7 +246,7 @@ def test_times_are_those_of_first_and_last_bytes() -> None:
 
 def test_large_messages_are_counted_and_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tap, "MOST_BYTES", 1000)
-    monkeypatch.setattr(tap, "WHOLE_BYTES", 1000)
+    monkeypatch.setattr(tap, "DECODED_BYTES", 1000)
     large = packb({"actions": np.zeros((50, 20))})
     parts = [up(packb(OBSERVATION)), down(large[:900], fin=False), down(large[900:], Opcode.CONT)]
     (seen,) = fed(WebsocketReader, [*HANDSHAKE, *parts], 500)

@@ -26,7 +26,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.grpc import LEROBOT
 from s2a_bench.plugins.policy_servers.grpc.client import SERVICE, bytes_in
 from s2a_bench.plugins.policy_servers.grpc.pickles import chunk_in
-from s2a_bench.transport.tap import LETTERS, MOST_PIECES, MOST_WAITING, Incoming, ParsedTapReader, Seen
+from s2a_bench.transport.tap import LETTERS, MOST_WAITING, Incoming, ParsedTapReader, Seen
 
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 SEND, GET = f"grpc {SERVICE}SendObservations", f"grpc {SERVICE}GetActions"
@@ -44,8 +44,8 @@ ERRORS: Final = {str(code.value[0]).encode(): f"gRPC {code.name}" for code in gr
 
 
 class SeenCall:
-    def __init__(self, seen: Seen) -> None:
-        self.seen, self.head, self.chunk = seen, b"", b""
+    def __init__(self, seen: Seen, piece: Callable[[Seen], None]) -> None:
+        self.seen, self.head, self.chunk, self._piece = seen, b"", b"", piece
         self.whole = False  # its request
         self._answer = Incoming(self._messages)
 
@@ -68,8 +68,7 @@ class SeenCall:
                 self.chunk = yield from incoming.read(size)
             else:
                 yield from incoming.skip(size)
-            if len(self.seen.pieces_ns) < MOST_PIECES:
-                self.seen.pieces_ns.append(self.seen.end_ns)
+            self._piece(self.seen)
 
 
 class GrpcReader(ParsedTapReader):
@@ -108,7 +107,7 @@ class GrpcReader(ParsedTapReader):
 
     def _called(self, stream: int, path: bytes, from_ns: int) -> SeenCall:
         name = "".join(filter(str.isprintable, path.decode(errors="replace")))[:LETTERS]
-        self._calls[stream] = call = SeenCall(Seen(f"grpc {name}", from_ns))
+        self._calls[stream] = call = SeenCall(Seen(f"grpc {name}", from_ns), self.piece)
         self.fresh(call.seen)
         if len(self._calls) > MOST_WAITING:
             raise ValueError(f"more than {MOST_WAITING} calls without an answer")

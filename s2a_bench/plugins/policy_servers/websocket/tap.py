@@ -17,8 +17,8 @@ from websockets.frames import CTRL_OPCODES, Frame, Opcode
 from s2a_bench.errors import RequestFailed
 from s2a_bench.facts import INFER_MS
 from s2a_bench.plugins.policy_servers.websocket import codec
-from s2a_bench.transport.http.tap import WHOLE_BYTES, HttpReader, chunk_of, loaded
-from s2a_bench.transport.tap import FAILED, MOST_BYTES, Incoming, Seen
+from s2a_bench.transport.http.tap import HttpReader, chunk_of, loaded
+from s2a_bench.transport.tap import DECODED_BYTES, FAILED, MOST_BYTES, Incoming, Seen
 
 CONTROL_BYTES: Final = 125
 """The most that a control frame has (RFC 6455, 5.5), and the longest head of any."""
@@ -56,7 +56,7 @@ class WebsocketReader(HttpReader):
                 seen, size, data = self.begin_request(self._what) if up else self.begin_answer(), 0, bytearray()
                 text = opcode == Opcode.TEXT
             wanted = seen and not self._extensions and (not up or self._what not in self._known)
-            most = (MOST_BYTES if up else WHOLE_BYTES) - len(data) if wanted else 0
+            most = (MOST_BYTES if up else DECODED_BYTES) - len(data) if wanted else 0
             frame, length = yield from _frame(incoming, max(most, CONTROL_BYTES), self._extensions, mask=up)
             if frame.opcode in CTRL_OPCODES:
                 self.pings += frame.opcode is Opcode.PING

@@ -15,7 +15,7 @@ import msgpack
 from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.zmq import layouts
 from s2a_bench.plugins.policy_servers.zmq.wire import read
-from s2a_bench.transport.tap import FAILED, MOST_BYTES, Incoming, ParsedTapReader, Seen
+from s2a_bench.transport.tap import DECODED_BYTES, FAILED, MOST_BYTES, Incoming, ParsedTapReader, Seen
 
 MORE, LONG, COMMAND = 1, 2, 4
 """Flags of a frame."""
@@ -24,8 +24,6 @@ MECHANISMS: Final = (b"NULL", b"PLAIN")
 PING: Final = b"\x04PING"
 HEAD: Final = 512
 """Bytes of a request in which its endpoint stands."""
-ANSWER_BYTES: Final = 4 << 20
-"""Most bytes of an answer that is decoded."""
 WHAT, ACT = "zmq", f"zmq {layouts.GET_ACTION}"
 NAME: Final = 40
 """Most letters of an endpoint."""
@@ -72,7 +70,7 @@ class ZmqReader(ParsedTapReader):
             seen.observation = message.get(layouts.DATA) if isinstance(message, dict) else None
 
     def _answer(self, incoming: Incoming, seen: Seen, size: int) -> Generator[None, None, None]:
-        if size > ANSWER_BYTES:
+        if size > DECODED_BYTES:
             yield from incoming.skip(size)
             return
         body = yield from incoming.read(size)
