@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-analysis bench-capacity bench-chunks bench-coverage bench-plans bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup clean
+.PHONY: bench bench-analysis bench-capacity bench-chunks bench-coverage bench-plans bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup site clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -93,6 +93,10 @@ core:
 
 setup:
 	@$(PYTHON) tools/setup.py
+
+# The pages as a site in build/site (Python 3.11 or newer), with the library's reference; SITE_FLAGS='-t offline' without the internet.
+site: setup
+	$(BIN)/sphinx-build -W --keep-going -q $(SITE_FLAGS) -c docs/site . build/site
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -2,11 +2,13 @@
 
 A field of a configuration is in backquotes, as `requests`: the command line shows it as its flag, --requests.
 
-S2AError
-├── UsageError, MissingExtra, SourceError, RobotError, SimulatorError, StoreError, UnlikeRuns, NotPermitted
-├── EngineError: ModelError, BadRequest, Overdue
-└── TransportError: MissingInterface, PortInUse, ServerDied, ClockMoved
-    └── RequestFailed: Busy, TooLarge, MessagesLost
+::
+
+    S2AError
+    ├── UsageError, MissingExtra, SourceError, RobotError, SimulatorError, StoreError, UnlikeRuns, NotPermitted
+    ├── EngineError: ModelError, BadRequest, Overdue
+    └── TransportError: MissingInterface, PortInUse, ServerDied, ClockMoved
+        └── RequestFailed: Busy, TooLarge, MessagesLost
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What can be measured or tried: one folder each, with its options, its run and its view.
 
-An experiment's ``__init__`` holds its declaration, which imports nothing heavy:
+An experiment's ``__init__`` holds its declaration, which imports nothing heavy::
 
     EXPERIMENT = Experiment(
         name="boundary",

@@ -59,7 +59,7 @@ GUARANTEE: Final[Any] = option(
 )
 """The option of whatever calibrates."""
 CHANCE: Final = 2.58
-"""Greatest |r1| by chance, over 1 / sqrt(n): 1 % of independent delays correlate more."""
+"""Greatest absolute r1 by chance, over 1 / sqrt(n): 1 % of independent delays correlate more."""
 ROUNDING: Final = 1e-9
 """A product this close below a whole number counts as whole."""
 

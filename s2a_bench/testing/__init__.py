@@ -1,7 +1,7 @@
 """Tools for the tests of plug-ins: one conformance suite for each seam, a virtual clock, a null progress.
 
 A suite is a class of pytest tests. A test module subclasses it under a name that begins with ``Test`` and provides the
-fixtures that the suite's docstring names:
+fixtures that the suite's docstring names::
 
     import pytest
     from s2a_bench.testing.policy import PolicySuite

@@ -2,13 +2,11 @@
 
 A policy answers an observation with a *chunk* of H actions, each meant for one control tick of Delta t:
 
-| term | meaning |
-|---|---|
-| latency L | from the observation until the chunk is usable |
-| delay d | L in ticks, floor or ceil of L / Delta t (`Rounding`) |
-| execution horizon s | actions of a chunk that are executed before the next chunk takes over |
-| trigger m | actions left when the next request leaves |
-| stall | a tick, after the first action, that finds no action to execute |
+- latency L: from the observation until the chunk is usable
+- delay d: L in ticks, floor or ceil of L / Delta t (`Rounding`)
+- execution horizon s: actions of a chunk that are executed before the next chunk takes over
+- trigger m: actions left when the next request leaves
+- stall: a tick, after the first action, that has no action to execute
 
 A chunk is a plan whose steps all take Delta t: S0 = max_i (t_i - i Delta t) is `schedule.safe_start` of both.
 
