@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from s2a_bench.report.compare.comparison import ComparedRuns
 
 Folder: TypeAlias = "str | Path | Run"
-Known = TypeVar("Known")
+Entry = TypeVar("Entry")
 SHOWN_DPI: Final = 150
 """Resolution of figures in notebooks, which are drawn twice as fine: 7 point text is legible and sharp."""
 
 
 class Run:
-    """One run, read from its folder; raises StoreError if it is none. A notebook shows its main tables."""
+    """One run, read from its folder; raises StoreError if there is not one. A notebook shows its main tables."""
 
     def __init__(self, path: str | Path) -> None:
         self._run = store.read_run(Path(path))
@@ -112,11 +112,11 @@ class Run:
             raise S2AError(f"all but this is written: {'; '.join(dict.fromkeys(failures))}")
         return self.path
 
-    def _one(self, known: Mapping[str, Known], kind: str, name: str) -> Known:
-        if name not in known:
-            names = "; ".join((", ".join(known) or "none", *self._shown.failures))
+    def _one(self, entries: Mapping[str, Entry], kind: str, name: str) -> Entry:
+        if name not in entries:
+            names = "; ".join((", ".join(entries) or "none", *self._shown.failures))
             raise UsageError(f"a {self.manifest['command']} run has no {kind} '{name}', only {names}")
-        return known[name]
+        return entries[name]
 
     @cached_property
     def _shown(self) -> Shown:
@@ -187,7 +187,7 @@ def run(
 
 
 def load(path: str | Path) -> Run:
-    """Open a run folder; raises StoreError if the folder is no run."""
+    """Open a run folder; raises StoreError if the folder does not hold one."""
     return Run(path)
 
 
@@ -239,17 +239,17 @@ def _read_csv(text: str, origins: Origins) -> pd.DataFrame:
 
 
 def _png(figure: Figure) -> tuple[bytes, dict[str, int]]:
-    drawn = io.BytesIO()
+    png = io.BytesIO()
     with paper_column():
-        figure.savefig(drawn, dpi=2 * SHOWN_DPI)
+        figure.savefig(png, dpi=2 * SHOWN_DPI)
     width, height = figure.get_size_inches() * SHOWN_DPI
-    return drawn.getvalue(), {"width": round(width), "height": round(height)}
+    return png.getvalue(), {"width": round(width), "height": round(height)}
 
 
 def _figure_html(figure: Figure) -> str:
-    drawn, size = _png(figure)
+    png, size = _png(figure)
     title, *notes = map(escape, caption_of(figure))
-    picture = f'<img width="{size["width"]}" alt="{title}" src="data:image/png;base64,{b64encode(drawn).decode()}">'
+    picture = f'<img width="{size["width"]}" alt="{title}" src="data:image/png;base64,{b64encode(png).decode()}">'
     return f"<figure>{picture}<figcaption><b>{title}.</b> {' '.join(notes)}</figcaption></figure>"
 
 

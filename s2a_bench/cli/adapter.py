@@ -94,16 +94,16 @@ def _flags_of_modes(experiment: Experiment) -> Iterator[Flag]:
         yield replace(first, panel=panel, about=about, needed=False)
 
 
-def _picked(experiment: Experiment, given: Mapping[str, Any]) -> type[Options]:
+def _picked(experiment: Experiment, values: Mapping[str, Any]) -> type[Options]:
     """Return the class of the mode that the flags pick; raises UsageError for options of another."""
     modes = experiment.every_mode
-    picking = {flag for mode in modes for flag in mode.flags if given.get(flag)}
+    picking = {flag for mode in modes for flag in mode.flags if values.get(flag)}
     mode = next((each for each in modes if {*each.flags} == picking), None)
     if mode is None:
         given_flags = " and ".join(f"`{flag}`" for flag in sorted(picking))
         more = next(({*each.flags} - picking for each in modes if picking < {*each.flags}), None)
         raise UsageError(f"{given_flags} needs `{min(more)}`" if more else f"{given_flags} exclude each other")
-    for name, value in given.items():
+    for name, value in values.items():
         other = None if value is None else experiment.other_mode(mode, name)
         if other and (value or name not in other.flags):
             missing = [f"give `{flag}`" for flag in other.flags if flag not in mode.flags]
@@ -163,9 +163,9 @@ def command(
     rest = later if MANY < len(listed) > len(later) else []
     more = [_help_all(len(listed) + len(keywords))] if rest else []
 
-    def run(**given: Any) -> None:
+    def run(**values: Any) -> None:
         with flags_named(*options):
-            function(*(build(each, given) for each in options), **{name: given[name] for name in keywords})
+            function(*(build(each, values) for each in options), **{name: values[name] for name in keywords})
 
     run.__signature__ = inspect.Signature([*(flag.parameter for flag in flags), *keywords.values(), *more])  # type: ignore[attr-defined]
     run.__doc__ = about
@@ -233,14 +233,14 @@ def _with_defaults(abouts: Mapping[str, str]) -> str:
     return DEFAULT.sub(f" [default: {defaults}]", first)
 
 
-def build(options: type[Options] | Experiment, given: Mapping[str, Any]) -> Options:
+def build(options: type[Options] | Experiment, values: Mapping[str, Any]) -> Options:
     """Build a configuration from a command's parameters; raises UsageError naming the field."""
     from s2a_bench.options import nested
 
     if not isinstance(options, type):
-        options = _picked(options, given)
+        options = _picked(options, values)
     typed = (flag for same in _by_name([*flags_of(options)]) for flag in same)
-    return options(**nested((flag.path, given[flag.key]) for flag in typed if given.get(flag.key) is not None))
+    return options(**nested((flag.path, values[flag.key]) for flag in typed if values.get(flag.key) is not None))
 
 
 @contextmanager

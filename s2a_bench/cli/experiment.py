@@ -52,14 +52,14 @@ class Commands(TyperGroup):
         return parsed
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        known = self.list_commands(ctx)
-        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
-            ctx.fail(f"No such command '{args[0]}'{like(args[0], known)}")
+        names = self.list_commands(ctx)
+        if args[0] not in names and not args[0].startswith("-") and not ctx.resilient_parsing:
+            ctx.fail(f"No such command '{args[0]}'{like(args[0], names)}")
         return super().resolve_command(ctx, args)
 
     def _abouts(self) -> dict[str, str]:
         """Return name -> help of every command, without importing the experiments."""
-        abouts = {name: made.get_short_help_str(limit=150) for name, made in self.commands.items()}
+        abouts = {name: command.get_short_help_str(limit=150) for name, command in self.commands.items()}
         abouts |= {name: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in self.experiments}
         return dict(sorted({**abouts, **{name: about for name, (_, about) in self.lazy.items()}}.items()))
 
@@ -73,13 +73,13 @@ class Commands(TyperGroup):
             formatter.write_dl([*self._abouts().items()])
 
 
-def _click(name: str, made: Any, about: str | None = None) -> Any:
-    group = made
-    if not isinstance(made, typer.Typer):
+def _click(name: str, command: Any, about: str | None = None) -> Any:
+    group = command
+    if not isinstance(command, typer.Typer):
         group = typer.Typer(**PLAIN)
-        group.command(name, help=about, cls=Flagged)(made)
+        group.command(name, help=about, cls=Flagged)(command)
     click: Any = typer.main.get_command(group)
-    click.name, click.rest = name, getattr(made, "rest", ())
+    click.name, click.rest = name, getattr(command, "rest", ())
     return click
 
 

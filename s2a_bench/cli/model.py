@@ -62,7 +62,7 @@ def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
 
 
 def _latency_command(model: Path, mmproj: Path | None = None) -> str | None:
-    """Return the command that measures with these files; None if they are no model."""
+    """Return the command that measures with these files; None if they are not those of a model."""
     from s2a_bench.inference.models import load_headers
 
     try:

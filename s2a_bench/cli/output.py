@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 WIDTH = 100
-"""Columns of a table if the output is no terminal and COLUMNS is not set."""
+"""Columns of a table if the output is not a terminal and COLUMNS is not set."""
 
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
 

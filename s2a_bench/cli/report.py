@@ -35,7 +35,7 @@ class CompareConfig(Options):
     def check(self) -> None:
         for name in ("strict", "one_launch"):
             if getattr(self, name) and not self.fail_if:
-                raise UsageError(f"`{name}`: there is no gate; add `fail_if`")
+                raise UsageError(f"`{name}`: no gate; add `fail_if`")
 
 
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:

@@ -61,26 +61,26 @@ class Read:
     """For the node's process."""
 
 
-def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
-    """Read the arguments for a node with ``known`` parameters; ``node`` has its default namespace and node_name.
+def read(text: str, allowed: Sequence[str], node: Mapping[str, str]) -> Read:
+    """Read the arguments for a node with the parameters ``allowed``; ``node`` has its default namespace and name.
 
     Raises UsageError for an unknown argument, and for a parameter that the node does not have.
     """
     result = Read()
-    given = list(_given(shlex.split(text)))
-    rules = [rule for kind, value in given if kind == "remap" if (rule := _pair(value, "-r", node["node_name"]))]
+    arguments = list(_given(shlex.split(text)))
+    rules = [rule for kind, value in arguments if kind == "remap" if (rule := _pair(value, "-r", node["node_name"]))]
     renamed = {"__ns": "namespace", "__node": "node_name", "__name": "node_name"}
     result.options = {renamed[source]: target for source, target in rules if source in renamed}
     if remaps := [f"{source}:={target}" for source, target in rules if source not in renamed]:
         result.options["remap"] = remaps
     named = {**node, **result.options}
     name = f"{named['namespace']}/{named['node_name']}"
-    for kind, value in given:
+    for kind, value in arguments:
         if kind == "param":
             if pair := _pair(value, "-p", node["node_name"]):
-                _take(result, {pair[0]: _yaml(pair[1], f"-p {value}")}, known, "-p")
+                _take(result, {pair[0]: _yaml(pair[1], f"-p {value}")}, allowed, "-p")
         elif kind == "params_file":
-            _read_file(result, Path(value), known, name)
+            _read_file(result, Path(value), allowed, name)
         elif kind == "log_level":
             result.options["log_level"] = value.rpartition(":=")[2].lower()
         elif kind == "enclave":
@@ -96,7 +96,7 @@ def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
         if QUIET.fullmatch(argument):
             continue
         if argument not in VALUED:
-            raise UsageError(f"`ros_args`: {argument} is none of {', '.join(VALUED)}; {END} ends them")
+            raise UsageError(f"`ros_args`: {argument} is not one of {', '.join(VALUED)}; {END} ends them")
         value = next(rest, None)
         if value is None:
             raise UsageError(f"`ros_args`: {argument} needs a value")
@@ -112,20 +112,20 @@ def _pair(text: str, flag: str, node_name: str) -> tuple[str, str] | None:
     return None if separated and of_node != node_name else (name, right)
 
 
-def _take(result: Read, values: Mapping[str, Any], known: Sequence[str], where: str, *, shared: bool = False) -> None:
+def _take(result: Read, values: Mapping[str, Any], allowed: Sequence[str], where: str, *, shared: bool = False) -> None:
     """Store parameters; raises UsageError for an unknown one unless the section is ``shared`` with other nodes."""
     for name, value in values.items():
-        if name in known:
+        if name in allowed:
             result.options[name] = value
         elif name == OF_EVERY_NODE:
             continue
         elif shared:
-            result.notes.append(f"{where}: {name} is no parameter of this node and left out")
+            result.notes.append(f"{where}: {name} is not a parameter of this node and left out")
         else:
-            raise UsageError(f"`ros_args` {where}: {none_of(name, known)}")
+            raise UsageError(f"`ros_args` {where}: {none_of(name, allowed)}")
 
 
-def _read_file(result: Read, path: Path, known: Sequence[str], node_name: str) -> None:
+def _read_file(result: Read, path: Path, allowed: Sequence[str], node_name: str) -> None:
     from s2a_bench.toml_file import read as read_file
 
     whole = _yaml(read_file(path, "params_file"), f"--params-file {path}")
@@ -135,7 +135,7 @@ def _read_file(result: Read, path: Path, known: Sequence[str], node_name: str) -
     matching = [(pattern, values) for pattern, values in sections if _matches(pattern, node_name)]
     for pattern, values in matching:
         parameters = dict(dotted(values)) if isinstance(values, dict) else {}
-        _take(result, parameters, known, f"--params-file {path}, {pattern}", shared="*" in pattern)
+        _take(result, parameters, allowed, f"--params-file {path}, {pattern}", shared="*" in pattern)
     if not matching:
         listed = ", ".join(pattern for pattern, _ in sections)
         result.notes.append(f"--params-file {path} has nothing for {node_name}, only for {listed}")
@@ -162,4 +162,4 @@ def _yaml(text: str, where: str) -> Any:
     try:
         return YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError, RecursionError) as error:
-        raise UsageError(f"`ros_args`: {where} is no YAML: {next(iter(str(error).splitlines()), '')}") from error
+        raise UsageError(f"`ros_args`: {where} is not YAML: {next(iter(str(error).splitlines()), '')}") from error

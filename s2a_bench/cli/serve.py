@@ -68,22 +68,24 @@ def _config() -> type[Options]:
 
 def _serve(config: Any) -> None:
     """Serve a pipeline; raises UsageError for an option of another transport."""
-    chosen = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
-    if not chosen.serves:
-        raise UsageError(f"`transport`: {chosen.name} is a client alone; start the server of which it is one")
+    transport = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
+    if not transport.serves:
+        raise UsageError(f"`transport`: {transport.name} is a client alone; start the server of which it is one")
     for other, _ in TRANSPORTS.loaded():
-        if stray := sorted(getattr(config, other, Options()).model_fields_set - {*served_options(chosen)}):
-            raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(served_options(chosen))}")
-    flags = getattr(config, chosen.name, Options()).given_values()
+        if stray := sorted(getattr(config, other, Options()).model_fields_set - {*served_options(transport)}):
+            raise UsageError(
+                f"`{stray[0]}` is not an option of {transport.name}; it has {', '.join(served_options(transport))}"
+            )
+    flags = getattr(config, transport.name, Options()).given_values()
     where = f"`config` {config.config}"
     of_toml = loads(read(config.config, "config"), where) if config.config else {}
-    of_file = _sorted({key.replace("-", "_"): value for key, value in of_toml.items()}, where, chosen)
-    of_args = _ros_args(config.ros_args, chosen, {**of_file[1], **flags})
+    of_file = _sorted({key.replace("-", "_"): value for key, value in of_toml.items()}, where, transport)
+    of_args = _ros_args(config.ros_args, transport, {**of_file[1], **flags})
     of_engine, of_transport, of_limits = (low | high for low, high in zip(of_file, of_args, strict=True))
     limits = Limits(**of_limits | config.limits.given_values())
-    pipeline = one_pipeline(config.pipeline, **{**chosen.options.SERVE_DEFAULTS, **of_transport, **flags})
+    pipeline = one_pipeline(config.pipeline, **{**transport.options.SERVE_DEFAULTS, **of_transport, **flags})
     engine = EngineConfig(**of_engine | config.engine.given_values())
-    address = next(iter(chosen.addresses(pipeline.options)))
+    address = next(iter(transport.addresses(pipeline.options)))
     _run(pipeline.wiring(address, limits=limits), _answering(engine, pipeline))
 
 
@@ -97,40 +99,40 @@ def _answering(engine: EngineConfig, pipeline: Pipeline) -> EngineConfig:
     return engine.but(answer=answer)
 
 
-def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> Sorted:
+def _ros_args(text: str, transport: Transport[Any], given: Mapping[str, Any]) -> Sorted:
     if not text:
         return {}, {}, {}
-    if "node_name" not in served_options(chosen):
-        raise UsageError(f"`ros_args` are for ROS 2 nodes, not for serve {chosen.name}")
-    node = {name: given.get(name, getattr(_as_served(chosen)(), name)) for name in ("namespace", "node_name")}
-    arguments = read_ros_args(text, _known(chosen), node)
+    if "node_name" not in served_options(transport):
+        raise UsageError(f"`ros_args` are for ROS 2 nodes, not for serve {transport.name}")
+    node = {name: given.get(name, getattr(_as_served(transport)(), name)) for name in ("namespace", "node_name")}
+    arguments = read_ros_args(text, _known(transport), node)
     os.environ.update(arguments.environ)
     for note in arguments.notes:
         typer.echo(f"--ros-args: {note}", err=True)
-    return _sorted(arguments.options, "`ros_args`", chosen)
+    return _sorted(arguments.options, "`ros_args`", transport)
 
 
-def _known(chosen: Transport[Any]) -> list[str]:
+def _known(transport: Transport[Any]) -> list[str]:
     limits = [flag.name.replace("-", "_") for flag in flags_of(Limits) if flag.path[0] in SET]
-    return ["engine", *ENGINE[1:], *served_options(chosen), *limits]
+    return ["engine", *ENGINE[1:], *served_options(transport), *limits]
 
 
-def _sorted(values: Mapping[str, Any], where: str, chosen: Transport[Any]) -> Sorted:
+def _sorted(values: Mapping[str, Any], where: str, transport: Transport[Any]) -> Sorted:
     """Sort options into those of the engine, of the transport, and limits; raises UsageError naming the key."""
-    known = _known(chosen)
+    known = _known(transport)
     for name, value in values.items():
         if name not in known:
             raise UsageError(f"{where}: {none_of(name, known).replace('_', '-')}")
-        if isinstance(value, bool) and chosen.options.model_fields.get(name, _NUMBER).annotation is not bool:
+        if isinstance(value, bool) and transport.options.model_fields.get(name, _NUMBER).annotation is not bool:
             raise UsageError(f"{where}: {name} = {value} should be a number or a text")
     of_engine, of_limits = (
         placed(kind, {name: value for name, value in values.items() if name in places(kind)})
         for kind in (EngineConfig, Limits)
     )
-    of_transport = {name: value for name, value in values.items() if name in served_options(chosen)}
+    of_transport = {name: value for name, value in values.items() if name in served_options(transport)}
     try:
         EngineConfig(**of_engine)
-        chosen.options(**of_transport)
+        transport.options(**of_transport)
         Limits(**of_limits)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error

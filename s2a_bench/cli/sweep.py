@@ -129,9 +129,9 @@ ENTRY = f"{__name__}:run"
 
 def command_of(name: str, key: str = "command", *, trusted: bool = False) -> SweepCommand:
     """Describe a command; cells of a ``trusted`` file may run programs, and send keys and files to a URL."""
-    known = sorted(EXPERIMENTS)
-    if name not in known:
-        raise UsageError(f"{key}: {none_of(name, known)}")
+    names = sorted(EXPERIMENTS)
+    if name not in names:
+        raise UsageError(f"{key}: {none_of(name, names)}")
     flags: dict[str, Any] = {}
     for parameter in click_command(name).params:
         if parameter.param_type_name == "argument":
@@ -156,12 +156,12 @@ def run(argv: Sequence[str]) -> None:
 def _check(name: str, argv: Sequence[str], *, trusted: bool) -> bool:
     """Parse arguments without running them; return True if the command only computes and measures nothing."""
     try:
-        given = click_command(name).make_context(name, list(argv)).params
+        values = click_command(name).make_context(name, list(argv)).params
     except ParseError as error:
         raise UsageError(error.format_message()) from error
     kinds = options_of(EXPERIMENTS[name])
     with flags_named(*kinds):
-        config = build(kinds[0], given)
+        config = build(kinds[0], values)
         if not trusted and (risk := _risk([*config.risks()])):
             raise UsageError(f"{risk}; read the file, and allow it with `trust_file`")
     return config.virtual

@@ -105,7 +105,7 @@ def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
 def plain(value: Any) -> Any:
     """Convert a value to JSON types: dataclasses to objects, paths to text, NaN and infinity to null.
 
-    Secrets are struck out; half a surrogate pair, as in an argument that is no UTF-8, is escaped.
+    Secrets are struck out; half a surrogate pair, as in an argument that is not UTF-8, is escaped.
     """
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
@@ -132,7 +132,7 @@ def write(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Replace the manifest atomically."""
     path, part = folder / NAME, folder / f"{NAME}.part"
     try:
-        # half a surrogate pair, from bytes of argv that are no UTF-8, becomes the escape of JSON
+        # half a surrogate pair, from bytes of argv that are not UTF-8, becomes the escape of JSON
         with part.open("w", encoding="utf-8", errors="backslashreplace") as file:
             json.dump(manifest, file, indent=2, ensure_ascii=False, allow_nan=False)
             file.write("\n")
@@ -150,7 +150,7 @@ def read(folder: Path) -> dict[str, Any]:
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise StoreError(f"{folder} is no run folder: {path}: {error.strerror}") from error
+        raise StoreError(f"{folder} is not a run folder: {path}: {error.strerror}") from error
     try:
         manifest = json.loads(text)
         json.dumps(manifest, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed

@@ -43,7 +43,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         self.path = path
         self._manifest = manifest
         self._finished = False
-        self._made: Sequence[Path] = ()
+        self._created: Sequence[Path] = ()
         self._rows = 0
         self._codes: dict[str, str] = {}
         try:
@@ -69,7 +69,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         host = socket.gethostname()
         stem = f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}-{_slug(command)}-{_slug(host)}"
         try:
-            made = [folder for folder in (Path(root), *Path(root).parents) if not folder.exists()]
+            created = [folder for folder in (Path(root), *Path(root).parents) if not folder.exists()]
             path = _make_unique(Path(root), stem)
         except (FileExistsError, NotADirectoryError) as error:
             raise StoreError(f"`output` {root}: {error.filename} is not a folder; name another one") from error
@@ -91,7 +91,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         }
         manifests.merge(whole, manifest)
         run = cls(path, whole)
-        run._made = (path, *made)
+        run._created = (path, *created)
         for table in (run._samples, TOKENS) if tables is None else tables:
             run.append(table, [])
         return run
@@ -100,7 +100,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     def reopen(cls, path: Path, tables: Iterable[Table[Any]]) -> RunWriter:
         """Resume a run folder with its manifest and the whole records of ``tables``; no other process may write it.
 
-        Raises StoreError if it is no run folder, of another version, or cannot be written.
+        Raises StoreError if it is not a run folder, of another version, or cannot be written.
         """
         manifest = manifests.read(path) | {"state": "running", "error": None, "finished": None}
         run = cls(path, manifest)
@@ -178,7 +178,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        empty = self._made and not (self._rows or self._finished) and str(self.path) not in str(error)
+        empty = self._created and not (self._rows or self._finished) and str(self.path) not in str(error)
         if error is not None and empty and self._discard():
             return
         ended: Ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
@@ -198,7 +198,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
             for _, file in self._files.values():
                 file.close()
             shutil.rmtree(self.path, ignore_errors=True)
-            for folder in self._made[1:]:
+            for folder in self._created[1:]:
                 folder.rmdir()
         return not self.path.exists()
 
@@ -282,7 +282,7 @@ class StoredRun:
 
 
 def read_run(path: Path) -> StoredRun:
-    """Open a run folder for reading; raises StoreError if it is none, or of another version."""
+    """Open a run folder for reading; raises StoreError if it is not one, or of another version."""
     path = Path(path)
     return StoredRun(path, manifests.read(path))
 

@@ -73,7 +73,7 @@ def is_sweep(manifest: dict[str, Any]) -> bool:
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Read a sweep's folder, finished or not; raises StoreError if it is none."""
+    """Read a sweep's folder, finished or not; raises StoreError if it is not one."""
     import pandas as pd
 
     run = read_run(path)

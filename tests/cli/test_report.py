@@ -54,8 +54,8 @@ def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["/no/such/folder"], 1, "error: /no/such/folder is no run folder"),
-        (["{here}"], 1, "is no run folder"),
+        (["/no/such/folder"], 1, "error: /no/such/folder is not a run folder"),
+        (["{here}"], 1, "is not a run folder"),
         (["{run}", "--against", "rivals"], 2, "--against: 'rivals' should be paper; two runs are compared with"),
         (["{run}", "--output", "{here}"], 2, "--output: {here} is a folder; name a file"),
         (["{run}", "--output", "{here}/mine.html"], 2, "s2a-bench report did not write it; name another file"),

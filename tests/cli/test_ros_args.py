@@ -68,9 +68,9 @@ def test_an_enclave_reaches_rclpy_by_its_variable() -> None:
         (["-r", "a=b"], "-r a=b should look like from:=to"),
         (["-p", "max_tokens"], "-p max_tokens should look like name:=value"),
         (["-p", "max_toks:=7"], "-p: 'max_toks' is none of engine, max_tokens"),
-        (["-p", "engine:=[a"], "-p engine:=.* is no YAML"),
+        (["-p", "engine:=[a"], "-p engine:=.* is not YAML"),
         (["-p"], "-p needs a value"),
-        (["--enclav", "x"], "--enclav is none of -r, --remap"),
+        (["--enclav", "x"], "--enclav is not one of -r, --remap"),
         (["--params-file", "/nowhere/x.yaml"], "`params_file`: cannot read /nowhere/x.yaml"),
     ],
 )
@@ -101,7 +101,7 @@ def test_what_all_nodes_share_may_be_for_others(file: Path) -> None:
     found = parsed("--params-file", str(file))
     assert found.options == {"use_sim_time": True, "max_tokens": 4}
     (note,) = found.notes
-    assert "wheel.radius is no parameter of this node" in note
+    assert "wheel.radius is not a parameter of this node" in note
 
 
 def test_a_file_for_others_is_said_to_be(file: Path) -> None:
@@ -114,12 +114,12 @@ def test_a_file_for_others_is_said_to_be(file: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("a: [", "is no YAML"),
+        ("a: [", "is not YAML"),
         ("a: 1", "has no 'ros__parameters'"),
         ("- a", "has no 'ros__parameters'"),
         ("", "has no 'ros__parameters'"),
         ("/llama/server:\n  ros__parameters: {wheel: 1}", r"/llama/server: 'wheel' is none of engine"),
-        ("!!python/object:os.system a", "is no YAML"),
+        ("!!python/object:os.system a", "is not YAML"),
     ],
 )
 def test_a_file_that_is_none_is_refused(file: Path, content: str, message: str) -> None:

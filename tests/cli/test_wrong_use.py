@@ -13,11 +13,11 @@ ECHO, LLAMA = (Path(__file__).parents[2] / "results" / "reference" / name for na
 WRONG = {
     "compare": [
         (f"{ECHO}", "Missing argument 'B'"),
-        (f"{ECHO} /no/such", "/no/such is no run folder", 1),
+        (f"{ECHO} /no/such", "/no/such is not a run folder", 1),
         (f"{ECHO} {LLAMA}", "the runs are unlike: model engine: echo against llama; provenance engine: echo ", 1),
         (f"{ECHO} {ECHO} --fail-if 'zmq:e2e>5%'", "no cell with e2e is called 'zmq'; there are ros/topic, http/as-"),
-        (f"{ECHO} {ECHO} --strict", "--strict: there is no gate; add --fail-if"),
-        (f"{ECHO} {ECHO} --one-launch", "--one-launch: there is no gate; add --fail-if"),
+        (f"{ECHO} {ECHO} --strict", "--strict: no gate; add --fail-if"),
+        (f"{ECHO} {ECHO} --one-launch", "--one-launch: no gate; add --fail-if"),
         (f"{ECHO} {ECHO} --min-effect -1", "--min-effect"),
         (f"{ECHO},{ECHO} {ECHO}", "A: a folder is named twice"),
         (f"{ECHO} ' , '", "B: name a run folder"),
@@ -85,7 +85,7 @@ WRONG = {
         ("papr", "; did you mean paper?"),
         ("", "name a sweep file, or the folder of a sweep with --resume"),
         ("paper --retry-failed", "--retry-failed: name the sweep's folder with --resume"),
-        ("--resume /nowhere", "/nowhere is no run folder", 1),
+        ("--resume /nowhere", "/nowhere is not a run folder", 1),
     ],
     "serve": [
         ("pigeon", "--transport: 'pigeon' is none of http, ros, loopback"),

@@ -246,7 +246,7 @@ def test_too_few_or_too_short_answers_are_refused_before_there_is_a_folder(tmp_p
 
 
 def test_a_folder_without_a_run_or_answers_is_named(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="is no run folder"):
+    with pytest.raises(StoreError, match="is not a run folder"):
         recordings(tmp_path)
     with pytest.raises(UsageError, match="holds no answers"):
         recordings(recorded_run(tmp_path, 0, 3))

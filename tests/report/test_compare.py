@@ -251,10 +251,10 @@ def test_repeated_launches_are_compared_by_launch(launch: Launch) -> None:
 def test_a_metric_that_there_is_not_is_answered_by_those_there_are(launch: Launch) -> None:
     both = opened(launch(1, n=6), launch(2, n=6))
     with pytest.raises(
-        UsageError, match="'speed' is no metric of these latency runs; there are e2e_without_inference, "
+        UsageError, match="'speed' is not a metric of these latency runs; there are e2e_without_inference, "
     ):
         metrics_of(both, ["speed"])
-    with pytest.raises(UsageError, match=r"'e2e\.p98' is no metric .*; the statistics are median, mean, p90, p99"):
+    with pytest.raises(UsageError, match=r"'e2e\.p98' is not a metric .*; the statistics are median, mean, p90, p99"):
         metrics_of(both, ["e2e.p98"])
     with pytest.raises(UsageError, match="no cell has base64_encode on both sides"):
         metrics_of(both, ["base64_encode"])

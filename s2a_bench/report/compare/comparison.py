@@ -211,7 +211,7 @@ def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str
     else:
         has = [one for one in metrics if any(_rows(pair, one) for pair in compared.pairs)]
         known = f"the statistics are {', '.join(STATISTICS)}" if stem in metrics else f"there are {', '.join(has)}"
-        raise UsageError(f"{flag}: '{name}' is no metric of these {compared.command} runs; {known}")
+        raise UsageError(f"{flag}: '{name}' is not a metric of these {compared.command} runs; {known}")
     if not any(_rows(pair, metric.name) for pair in compared.pairs):
         raise UsageError(f"{flag}: no cell has {metric.name} on both sides")
     return metric, statistic
