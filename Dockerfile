@@ -1,4 +1,4 @@
-# s2a-bench with the base install, on a CPU: loopback, HTTP and ROS 2 over Cyclone DDS (Zenoh on aarch64). docs/containers.md
+# s2a-bench with the base install, on a CPU: loopback, HTTP, ROS 2 over Cyclone DDS (aarch64: Zenoh). docs/containers.md
 # Not built yet: no builder was available. A test lints this file and runs its pip commands in a virtual environment.
 FROM python:3.12-slim AS build
 WORKDIR /src

@@ -10,7 +10,8 @@ RUN apt-get update && apt-get install -y --no-install-recommends python3-venv ro
     && rosdep update && rosdep install --from-paths src --ignore-src -y && rm -rf /var/lib/apt/lists/*
 # NumPy 1, for which ROS's message modules are compiled; colcon's build of s2a-bench is the one that is used
 RUN python3 -m venv --system-site-packages venv && touch venv/COLCON_IGNORE && . venv/bin/activate \
-    && pip install --no-cache-dir -c src/s2a-bench/constraints-ros-jazzy.txt src/s2a-bench && pip uninstall -y s2a-bench \
+    && pip install --no-cache-dir -c src/s2a-bench/constraints-ros-jazzy.txt src/s2a-bench \
+    && pip uninstall -y s2a-bench \
     && source /opt/ros/jazzy/setup.bash && python -m colcon build
 RUN printf '%s\n' 'source /ws/install/setup.bash' 'source /ws/venv/bin/activate' \
     'exec /ws/install/s2a_bench/lib/s2a_bench/s2a-bench "$@"' > /ws/run.bash \

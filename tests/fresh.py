@@ -35,21 +35,23 @@ def copy_checkout(to: Path, *tops: str) -> Path:
     return to
 
 
-def run(*command: str | Path, cwd: Path, timeout_s: float = 600) -> str:
-    """Run a program that succeeds, and return what it prints."""
-    done = subprocess.run(command, cwd=cwd, env=ALONE, capture_output=True, text=True, check=False, timeout=timeout_s)
-    assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
-    return done.stdout
+def run(*command: str | Path, cwd: Path, **environ: str) -> str:
+    """Run a program that succeeds, with additions to its environment, and return what it prints.
 
-
-def pip(python: Path | str, *arguments: str | Path, cwd: Path) -> str:
-    """Run this environment's pip for another Python; skip the test where no package index answers."""
-    command = [sys.executable, "-m", "pip", "--python", python, *arguments]
-    done = subprocess.run(command, cwd=cwd, env=ALONE, capture_output=True, text=True, check=False, timeout=600)
+    Skip the test if it is pip and no package index answers.
+    """
+    done = subprocess.run(
+        command, cwd=cwd, env=ALONE | environ, capture_output=True, text=True, check=False, timeout=600
+    )
     if "NewConnectionError" in done.stderr or "NameResolutionError" in done.stderr:
         pytest.skip("no package index can be reached")
     assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
     return done.stdout
+
+
+def pip(python: Path, *arguments: str | Path, cwd: Path) -> None:
+    """Run this environment's pip for another Python."""
+    run(sys.executable, "-m", "pip", "--python", python, *arguments, cwd=cwd)
 
 
 def pythons() -> list[str]:

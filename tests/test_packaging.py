@@ -7,6 +7,7 @@ import sys
 import tarfile
 import zipfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -79,18 +80,21 @@ def test_the_sdist_has_what_the_wheel_is_made_of_and_the_pins(built: tuple[Path,
 
 
 @pytest.mark.parametrize("place", [0, -1], ids=["oldest", "newest"])
-def test_wheel_and_sdist_work_in_a_fresh_environment(place: int, built: tuple[Path, Path], tmp_path: Path) -> None:
+def test_wheel_and_sdist_work_in_a_fresh_environment(place: int, built: tuple[Path, Path]) -> None:
     every = pythons()
     if not every or (place and len(every) == 1):
         pytest.skip("no other supported Python is installed")
     sdist, wheel = built
-    python = environment(every[place], tmp_path / "venv")
-    pip(python, "install", "--quiet", "--no-compile", "-c", ROOT / "constraints.txt", wheel, cwd=tmp_path)
-    works(python, tmp_path / "wheel")
-    pip(python, "install", "--quiet", "--no-compile", "--no-deps", "--force-reinstall", sdist, cwd=tmp_path)
-    works(python, tmp_path / "sdist")
-    where = run(python, "-c", "import s2a_bench; print(s2a_bench.__file__)", cwd=tmp_path)
-    assert where.startswith(str(tmp_path / "venv"))
+    install = ("install", "--quiet", "--no-compile")
+    with TemporaryDirectory(prefix="s2a-fresh-") as folder:  # 700 MB, so that it is not kept
+        at = Path(folder)
+        python = environment(every[place], at / "venv")
+        pip(python, *install, "-c", ROOT / "constraints.txt", wheel, cwd=at)
+        works(python, at / "wheel")
+        pip(python, *install, "--no-deps", "--force-reinstall", sdist, cwd=at)
+        works(python, at / "sdist")
+        where = run(python, "-c", "import s2a_bench; print(s2a_bench.__file__)", cwd=at)
+        assert where.startswith(str(at / "venv"))
 
 
 def works(python: Path, folder: Path) -> None:
