@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 SUPPORTED = range(10, 14)
-"""Minor versions of Python 3 for which every dependency has a wheel: cyclonedds 11.0.1 has none for 3.14."""
+"""Minor versions of Python 3 that docs/install.md names."""
 ALONE = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "VIRTUAL_ENV"}}
 """The environment of a program that sees no checkout."""
 
