@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import webbrowser
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ QUESTIONS: Final = {
     "latency": "What transports cost, measured here without a model:",
     "timeline": "When the robot may act, EMULATED after the paper's boards (computed, so there is no interval):",
 }
+ANSWER: Final = re.compile("times as long as|no difference|stall")
 NEXT: Final = (
     "s2a-bench latency --url http://127.0.0.1:8000    # a server that runs already",
     "s2a-bench timeline --rate 10 --jitter lognormal:cv=0.2    # the tokens/s of your model",
@@ -67,10 +69,8 @@ demo = command(_demo, DemoConfig)
 
 
 def read_off(name: str, sentences: Sequence[str]) -> list[str]:
-    """Return the question and the run's sentences that answer it: the first and last ratio, or every policy."""
-    ratios = [sentence for sentence in sentences if "times as long as" in sentence]
-    answers = dict.fromkeys((*ratios[:1], *ratios[-1:])) if ratios else sentences[1:]
-    return [QUESTIONS[name], *(f"  {sentence}" for sentence in answers)]
+    """Return an experiment's question, and those of its run's sentences that answer it."""
+    return [QUESTIONS[name], *(f"  {sentence}" for sentence in sentences if ANSWER.search(sentence))]
 
 
 def _run(output: Path) -> list[Path]:
