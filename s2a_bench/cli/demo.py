@@ -54,9 +54,9 @@ def _demo(config: DemoConfig) -> None:
         chapters[place] = replace(chapter, content=replace(chapter.content, figures=figures))
     write_report(make_report(chapters), to_page)
     for chapter in chapters:
-        for warning in chapter.manifest["warnings"]:
+        for warning in chapter.run.manifest["warnings"]:
             print_error(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
-        for line in read_off(str(chapter.manifest["command"]), chapter.content.sentences):
+        for line in read_off(str(chapter.run.manifest["command"]), chapter.content.sentences):
             print_line(line)
     for line in (f"The page has both: {page}", "To go on:", *(f"  {line}" for line in NEXT)):
         print_line(line)
