@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import base64
+import json
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -114,18 +117,56 @@ run
 """
 
 
-@pytest.mark.slow
-def test_a_notebook_shows_figures_without_magics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+EXAMPLE = Path(__file__).parent.parent / "examples" / "first_contact.ipynb"
+
+
+@pytest.fixture
+def execute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Any]]:
+    """Return what executes a notebook in a temporary folder, and returns its cells of code."""
     nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
-    nbformat = pytest.importorskip("nbformat").v4
     pytest.importorskip("ipykernel", reason="ipykernel is not installed")
     for name in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR"):
         monkeypatch.setenv(name, str(tmp_path))
+
+    def executed(notebook: Any) -> list[Any]:
+        nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}}).execute()
+        return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+    return executed
+
+
+@pytest.mark.slow
+def test_a_notebook_shows_figures_without_magics(execute: Callable[[Any], list[Any]]) -> None:
+    nbformat = pytest.importorskip("nbformat").v4
     notebook = nbformat.new_notebook(cells=[nbformat.new_code_cell(cell) for cell in NOTEBOOK.split("---")])
-    nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    *drawn, shown = (cell.outputs for cell in notebook.cells)
+    *drawn, shown = (cell.outputs for cell in execute(notebook))
     for (output,) in drawn:
         assert base64.b64decode(output.data["image/png"]).startswith(b"\x89PNG")
         assert output.metadata["image/png"]["width"] == 525
         assert "<figcaption><b>Stall-free region of naive execution.</b> N = " in output.data["text/html"]
     assert "Boards: is naive stall-free?" in shown[0].data["text/html"]
+
+
+def test_the_example_is_kept_without_outputs_and_its_links_lead_somewhere() -> None:
+    cells = json.loads(EXAMPLE.read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert all((cell["outputs"], cell["execution_count"]) == ([], None) for cell in code)
+    links = re.findall(r"\]\(([^)]+)\)", "".join(line for cell in cells for line in cell["source"]))
+    assert len(links) > 3
+    assert [link for link in links if not (EXAMPLE.parent / link).exists()] == []
+
+
+@pytest.mark.slow
+def test_the_example_comes_to_tables_figures_and_a_ratio(execute: Callable[[Any], list[Any]]) -> None:
+    notebook = pytest.importorskip("nbformat").read(EXAMPLE, 4)
+    shown = {cell.id: cell.outputs[-1].data for cell in execute(notebook) if cell.outputs}
+    figures = {name: data for name, data in shown.items() if "image/png" in data}
+    assert list(figures) == ["figure", "plans"]
+    assert all(base64.b64decode(data["image/png"]).startswith(b"\x89PNG") for data in figures.values())
+    assert "Stages in ms" in shown["run"]["text/html"]
+    for stage in ("base64_encode", "json_parse", "cdr_pack", "return"):
+        assert stage in shown["table"]["text/html"]
+    (ratio,) = re.findall(r"ros/topic +([\d.]+) +([\d.]+) +([\d.]+)", shown["ratios"]["text/plain"])
+    value, low, high = map(float, ratio)
+    assert low < value < high
+    assert "network_ns" in shown["load"]["text/html"]

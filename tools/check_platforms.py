@@ -96,6 +96,7 @@ TARGETS = (
     Target("3.10", "x86_64", 35, "Ubuntu 22.04, Humble", ("dev", "ray")),
     Target("3.11", "x86_64", 36, "Debian 12", ("dev", "ray")),
     Target("3.12", "x86_64", 39, "Ubuntu 24.04, Jazzy", ("dev", "ray")),
+    Target("3.14", "x86_64", 39, "Ubuntu 26.04, base install"),
     Target("3.10", "aarch64", 35, "JetPack 6", BOARD),
     Target("3.12", "aarch64", 39, "Jazzy in a container", BOARD),
     Target("3.10", "x86_64", 35, "inside Humble", ("llama",), "constraints-ros-humble.txt"),

@@ -36,6 +36,7 @@ COMMANDS: Final[Registry[tuple[str, str]]] = Registry("commands", "command", {})
 
 _OURS: Final = {
     "compare": ("report:compare", "Compare run B with run A: effect sizes with intervals, one test, gates for CI."),
+    "demo": ("demo:demo", "A first look in 20 seconds, without a model: both questions on one page."),
     "doctor": ("doctor:doctor", "Check this machine: a line for each finding, warnings with their fix."),
     "model": ("model:app", "Fetch, make and inspect model files."),
     "profile": ("profile:app", "Measure this machine as a hardware profile, and show profiles."),

@@ -1,0 +1,90 @@
+"""`s2a-bench demo`: a short run for each question, one page of both, and what to read off it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from s2a_bench.cli.adapter import command
+from s2a_bench.cli.output import print_error, print_failures, print_line
+from s2a_bench.errors import S2AError
+from s2a_bench.inference import STAND_IN
+from s2a_bench.options import Options, option
+from s2a_bench.report.page import ReportConfig
+from s2a_bench.transport import RAW
+from s2a_bench.transport.defaults import COMPARED, LOOPBACK
+
+RUNS: Final[dict[str, dict[str, Any]]] = {
+    "latency": {"transports": (*COMPARED, LOOPBACK), "engine": STAND_IN, "payload": (RAW,), "requests": 100},
+    "timeline": {"tokens_per_skill": (6,)},
+}
+"""The options of each experiment: no model is loaded, and the timelines are computed."""
+FIGURES: Final = ("stages", "timeline")  # on the page, one of each experiment
+QUESTIONS: Final = {
+    "latency": "What transports cost, measured here without a model:",
+    "timeline": "When the robot may act, EMULATED after the paper's boards (computed, so there is no interval):",
+}
+ANSWER: Final = re.compile("times as long as|no difference|stall")
+NEXT: Final = (
+    "s2a-bench latency --url http://127.0.0.1:8000    # a server that runs already",
+    "s2a-bench timeline --rate 10 --jitter lognormal:cv=0.2    # the tokens/s of your model",
+)
+
+
+class DemoConfig(Options):
+    output: Path = option(Path("results"), "folder for run folders and the page, demo.html")
+    no_open: bool = option(False, "do not open the page in a browser")
+
+
+def _demo(config: DemoConfig) -> None:
+    from s2a_bench.report.page.chapters import read_chapters
+    from s2a_bench.report.page.files import make_report, write_report
+
+    page = config.output / "demo.html"
+    to_page = ReportConfig(runs=[], output=page)  # raises UsageError before anything is measured
+    chapters = read_chapters(_run(config.output))
+    for place, chapter in enumerate(chapters):
+        figures = {name: draw for name, draw in chapter.content.figures.items() if name in FIGURES}
+        chapters[place] = replace(chapter, content=replace(chapter.content, figures=figures))
+    write_report(make_report(chapters), to_page)
+    for chapter in chapters:
+        for warning in chapter.run.manifest["warnings"]:
+            print_error(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
+        for line in read_off(str(chapter.run.manifest["command"]), chapter.content.sentences):
+            print_line(line)
+    for line in (f"The page has both: {page}", "To go on:", *(f"  {line}" for line in NEXT)):
+        print_line(line)
+    if not config.no_open and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        webbrowser.open(page.resolve().as_uri())
+    print_failures(*((chapter.run.path, chapter.content.failures) for chapter in chapters))
+
+
+demo = command(_demo, DemoConfig)
+
+
+def read_off(name: str, sentences: Sequence[str]) -> list[str]:
+    """Return an experiment's question, and those of its run's sentences that answer it."""
+    return [QUESTIONS[name], *(f"  {sentence}" for sentence in sentences if ANSWER.search(sentence))]
+
+
+def _run(output: Path) -> list[Path]:
+    from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.library import run
+
+    folders: list[Path] = []
+    for name, options in RUNS.items():
+        with RunProgress() as progress:
+            try:
+                folders.append(run(name, output=output, progress=progress, **options).path)
+            except (S2AError, KeyboardInterrupt):
+                kept = [str(folder) for folder in (*folders, progress.folder) if folder and folder.exists()]
+                if kept:
+                    progress.say(f"what was measured so far: {shlex.join(['s2a-bench', 'report', *kept])}")
+                raise
+    return folders
