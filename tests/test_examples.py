@@ -79,7 +79,10 @@ class Block(NamedTuple):
     @property
     def commands(self) -> list[str]:
         """The commands of a session, whole."""
-        return re.findall(r"^\$ ((?:.*\\\n> )*.*)$", self.code, re.MULTILINE) if self.language == "console" else []
+        if self.language != "console":
+            return []
+        wrapped = re.findall(r"^\$ ((?:.*\\\n> )*.*)$", self.code, re.MULTILINE)
+        return [command.replace("\\\n> ", "") for command in wrapped]
 
     @property
     def server(self) -> Block | None:
@@ -220,7 +223,7 @@ def test_every_command_of_a_page_can_be_given(page: Path) -> None:
     """Those that cannot run here too have flags that there are."""
     for where, line in written():
         if where.partition(":")[0] == str(page.relative_to(ROOT)):
-            words = shlex.shlex(COMMENT.sub("", line.replace("\\\n> ", "")), posix=True, punctuation_chars=True)
+            words = shlex.shlex(COMMENT.sub("", line), posix=True, punctuation_chars=True)
             words.whitespace_split, words.commenters = True, ""
             for punctuation, command in groupby(words, lambda word: {*word} <= {*"();<>|&"}):
                 given = [*dropwhile(lambda word: re.match(r"\w+=|do$", word), command)]

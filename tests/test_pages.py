@@ -29,6 +29,49 @@ PAGES: Final = sorted(
 
 LINES: Final = 250
 """The longest page of docs/ that is not generated."""
+WIDTH: Final = 120
+LONG_LINES: Final = {
+    "CHANGELOG.md",
+    "docs/advise.md",
+    "docs/boundary.md",
+    "docs/capacity.md",
+    "docs/carla.md",
+    "docs/ccrb.md",
+    "docs/chunks-live.md",
+    "docs/chunks-triggers.md",
+    "docs/chunks.md",
+    "docs/closed-loop.md",
+    "docs/colcon.md",
+    "docs/compare.md",
+    "docs/executor.md",
+    "docs/frames.md",
+    "docs/latency.md",
+    "docs/links.md",
+    "docs/measuring.md",
+    "docs/model-plans.md",
+    "docs/plans.md",
+    "docs/policies.md",
+    "docs/policy-servers.md",
+    "docs/protocols.md",
+    "docs/query.md",
+    "docs/rclpy.md",
+    "docs/record.md",
+    "docs/report.md",
+    "docs/resources.md",
+    "docs/results.md",
+    "docs/ros2.md",
+    "docs/serve.md",
+    "docs/servers.md",
+    "docs/shift.md",
+    "docs/sweep.md",
+    "docs/task.md",
+    "docs/throughput.md",
+    "docs/timeline.md",
+    "docs/two-hosts.md",
+    "docs/watch.md",
+    "docs/zenoh.md",
+}
+"""Pages whose lines are still longer: this set shrinks."""
 
 
 def anchors(page: Path) -> set[str]:
@@ -59,6 +102,15 @@ def test_a_page_is_about_one_subject(page: Path) -> None:
     assert len(page.read_text(encoding="utf-8").splitlines()) <= LINES, "split it by subject"
 
 
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if str(page.relative_to(ROOT)) not in LONG_LINES],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_no_line_of_a_page_is_long(page: Path) -> None:
+    assert [line for line in page.read_text(encoding="utf-8").splitlines() if len(line) > WIDTH] == []
+
+
 def test_anchors_are_those_that_github_makes(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(
@@ -75,7 +127,7 @@ def linked(page: Path) -> set[Path]:
 def test_the_readme_is_short_and_links_little_after_its_first_screen() -> None:
     minute = README.index("\n## A minute\n")
     after = README[README.index("```\n", README.index("```", minute) + 3) :]
-    assert len(README.splitlines()) <= 130
+    assert len(README.splitlines()) <= 125
     assert len(re.findall(r"\]\(", after)) <= 16, "15 links, and the figure of the first screen"
 
 

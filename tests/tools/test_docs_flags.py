@@ -33,3 +33,9 @@ def test_a_page_of_flags_and_the_page_of_its_command_link_to_each_other(name: st
 def test_no_table_of_flags_is_by_hand() -> None:
     for page in sorted(DOCS.glob("*.md")):
         assert not re.search(r"^\| (flag|option) +\|", page.read_text(encoding="utf-8"), re.MULTILINE), page.name
+
+
+def test_an_entry_is_wrapped_and_its_code_stays_whole() -> None:
+    first, second = TOOL["entry"](f"`--flag`: {'x' * 90} and `a command of words` after it").splitlines()
+    assert first == f"- `--flag`: {'x' * 90} and"
+    assert second == "  `a command of words` after it"
