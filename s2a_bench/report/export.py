@@ -8,11 +8,11 @@ texts; equal ones have equal placeholders, so rows and manifest still fit.
 from __future__ import annotations
 
 import csv
+import os
 import re
 import socket
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
-from getpass import getuser
 from hashlib import sha256
 from itertools import count
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any, Final
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.inference import ENGINES
+from s2a_bench.machine.resources import SPENT
 from s2a_bench.provenance import Provenance
 from s2a_bench.store import files
 from s2a_bench.store import manifest as manifests
@@ -42,7 +43,7 @@ transport skills orders outcome env success stall period study cadence follower_
 """
 TEXTS: Final = frozenset(_TEXTS.split())
 """The keys whose text leaves, alone or in a list."""
-MAPS: Final = frozenset({"packages", "stages", "service", "variants"})
+MAPS: Final = frozenset({"stages", "service", "variants"})
 """The keys of mappings whose texts leave."""
 HASHED: Final = frozenset({"prompt", "grammar"})
 """The keys of texts of which a checksum leaves, as runs with different ones are not alike."""
@@ -56,13 +57,16 @@ COLUMNS: Final = frozenset(_COLUMNS.split())
 HIDDEN: Final = frozenset({"token_id"})
 """Columns of numbers from which a model's text can be restored."""
 
-_PLAIN: Final = frozenset({"localhost", "none", "home", "jetson", "nvidia", "ubuntu", *TEXTS, *COLUMNS, *STAGES})
-"""Words that identify nothing, even if a host has such a name."""
+_PLAIN: Final = "withheld localhost none home jetson nvidia ubuntu"
+"""Words that identify nothing, even if a host has such a name, as the words of stages, facts and keys."""
+_PASSES: Final = 3
+"""What one pass leaves beside a placeholder may be a path or an address."""
 _LONG: Final = 8
 """A shorter name of a host or user is removed as a separate word only."""
 _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00")
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?([eE][-+]?\d+)?|true|false")
-_VERSION: Final = re.compile(r"\d[\w.+!-]*")
+_CODE: Final = re.compile(r"[a-z0-9-]+")
+_VERSION: Final = re.compile(r"\d+(\.\d+){1,3}([.+-]?[A-Za-z]\w*)*")
 _NAME: Final = re.compile(r"[\w.-]*[A-Za-z][\w.-]*")
 _AT: Final = r"@(?=[A-Za-z\[]|\d+\.\d+\.\d)"
 _NAMED: Final = re.compile(
@@ -74,8 +78,8 @@ _NAMED: Final = re.compile(
 _PLACES: Final = (
     r"(?<![a-z0-9+.-])[a-z][a-z0-9+.-]*://[^\s\"',;)]*",
     rf"(?<![\w.+-])[\w.+-]+{_AT}[^\s\"',;)]*",
-    r"(?<![\w.:])(?:[0-9a-f]{0,4}:){2,7}[0-9a-f]{0,4}(?![\w:])",  # IPv6, MAC
-    r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w.])",
+    r"(?<![0-9a-z])(?:[0-9a-f]{0,4}:){2,7}[0-9a-f]{0,4}(?![0-9a-z])",  # IPv6, MAC
+    r"(?<!\d)\d{1,3}(?:\.\d{1,3}){3}(?!\d)",
     r"(?<!\w)(?:[a-z]:|~[\w-]*|\.{1,2})?[/\\]+[^\s\"',;)/\\][^\"',;)\n]*",
     r"[/\\]+(?:home|users)[/\\][^\"',;)\n]*",
     r"(?<![\w.~/\\-])[\w.~-]+(?:[/\\][\w.~-]+)*[/\\][\w.~-]*\.[a-z]\w*",  # a relative path to a file
@@ -87,31 +91,32 @@ class Words:
 
     def __init__(self, manifest: Mapping[str, Any]) -> None:
         """Collect the names of hosts and users that a manifest has anywhere, and those of this process."""
-        hosts, users = {socket.gethostname(), *map(str, manifest.get("machines") or ())}, {getuser()}
+        names = {socket.gethostname(), *(Path(os.environ.get(name, "")).name for name in ("HOME", "LOGNAME", "USER"))}
+        names |= {*map(str, manifest.get("machines") or ())}
         for key, text in _texts(manifest):
-            for *by_user, by_host in _NAMED.findall(text):
-                users |= {*by_user}
-                hosts.add(by_host)
-            hosts |= {*_NAME.findall(text)} if key == "host" else set()
-        plain = {*_PLAIN, *TRANSPORTS, *ENGINES, *EXPERIMENTS, *(field.name for field in fields(ExportedRun))}
-        plain |= {stage for _, transport in TRANSPORTS.loaded() for stage in transport.stages}
-        patterns = [_pattern(name, "A-Za-z0-9") for name in users if len(name) > 1 and name.lower() not in plain]
-        hosts |= {name.partition(".")[0] for name in hosts}
-        patterns += [_pattern(name, r"\w") for name in hosts if len(name) > 1 and name.lower() not in plain]
-        patterns.sort(key=lambda pattern: (-len(pattern), pattern))
+            names |= {name for match in _NAMED.findall(text) for name in match}
+            names |= {*_NAME.findall(text)} if key == "host" else set()
+        plain = _plain()
+        names |= {name.partition(".")[0] for name in names}
+        names = {name for name in names if len(name) > 1 and name.lower() not in plain}
+        patterns = sorted(map(_pattern, names), key=lambda pattern: (-len(pattern), pattern))
         self._names = re.compile("|".join(patterns) or r"(?!)", re.IGNORECASE)
         self._all = re.compile("|".join((*_PLACES, *patterns)), re.IGNORECASE)
         self._placeholders: dict[str, str] = {}
 
     def cleaned(self, text: str) -> str:
-        pattern = self._names if _VERSION.fullmatch(text) else self._all  # 5.0.0.93 is a version
-        return pattern.sub(self._placeholder, text)
+        for _ in range(_PASSES):
+            text = self._all.sub(self._placeholder, text)
+        return text
 
     def _placeholder(self, match: re.Match[str]) -> str:
         return self._placeholders.setdefault(match[0], f"{WITHHELD}-{len(self._placeholders) + 1}")
 
     def tree(self, value: Any, texts: Collection[str], key: str = "", *, shared: bool = False) -> Any:
         """Return JSON with its numbers and, if ``shared`` or under a key of ``texts``, its texts."""
+        if isinstance(value, dict) and key == "packages":  # 5.0.0.93 is no address there
+            versions = {self.cleaned(name): str(text) for name, text in value.items() if _VERSION.fullmatch(str(text))}
+            return {name: self._names.sub(self._placeholder, text) for name, text in versions.items()}
         if isinstance(value, dict):
             return {
                 self.cleaned(name): self.tree(item, texts, name, shared=name in texts or key in MAPS)
@@ -135,8 +140,15 @@ class Words:
         return [value if value and name not in HIDDEN and _NUMBER.fullmatch(value) else "" for value in values]
 
 
-def _pattern(name: str, letters: str) -> str:
-    return re.escape(name) if len(name) >= _LONG else f"(?<![{letters}]){re.escape(name)}(?![{letters}])"
+def _pattern(name: str) -> str:
+    return re.escape(name) if len(name) >= _LONG else f"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])"
+
+
+def _plain() -> set[str]:
+    transports = [transport for _, transport in TRANSPORTS.loaded()]
+    names = {*STAGES, *SPENT, *(name for each in transports for name in (*each.stages, *each.facts))}
+    names |= {*TEXTS, *COLUMNS, *TRANSPORTS, *ENGINES, *EXPERIMENTS, *(field.name for field in fields(ExportedRun))}
+    return {*_PLAIN.split(), *names, *(word for name in names for word in name.split("_"))}
 
 
 def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
@@ -210,7 +222,7 @@ def _manifest(kept: Mapping[str, Any], words: Words) -> dict[str, Any]:
         whole[name] = words.tree(kept[name], texts, name, shared=name in TEXTS)
     for name in ("started", "finished"):
         whole[name] = text if _TIME.fullmatch(text := str(kept.get(name))) else None
-    codes = [words.cleaned(warning["code"]) for warning in kept.get("warnings", [])]
+    codes = [words.cleaned(code) for each in kept.get("warnings", []) if _CODE.fullmatch(code := each["code"])]
     about = {"message": "the text of a warning is not shared", "advice": "see docs/share.md"}
     whole |= {"schema": kept["schema"], "state": kept["state"], "started": whole["started"] or ""}
     whole |= {KEY: {"schema": FORMAT, "files": {}}, "warnings": [{"code": code, **about} for code in codes]}

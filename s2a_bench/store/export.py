@@ -106,7 +106,7 @@ def check(folder: Path, manifest: Mapping[str, Any]) -> None:
     except ValidationError as error:
         where = ".".join(map(str, (KEY, *error.errors()[0]["loc"])))
         raise StoreError(f"{folder / NAME} is damaged: {where[:80]}: {error.errors()[0]['msg']}") from None
-    for path in (folder / name for name in {*files, *tables_in(folder)}):
+    for path in (folder / name for name in sorted({*files, *tables_in(folder)})):
         if (listed := files.get(path.name)) is None or not _TABLE.fullmatch(path.name):
             raise StoreError(f"{path} is not among the files of {folder / NAME}: remove it, or fetch the folder again")
         try:
