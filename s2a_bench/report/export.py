@@ -39,7 +39,7 @@ engine model_sha256 mmproj_sha256 quantisation architecture projector model_type
 llama_cpp_python sampling answer latency profile gaps prompt_origin title origin family guarantee asked chosen
 command mode payload size observation policies policy modes rules rounding simulator robot time transports request_id
 connection dialect qos dds_tuning middleware template layout llama_server follower gap jitter load limit service link
-transport skills orders outcome env success stall period study cadence follower_law
+transport skills orders outcome env success stall period study cadence follower_law weights tokens clock profiles robots
 """
 TEXTS: Final = frozenset(_TEXTS.split())
 """The keys whose text leaves, alone or in a list."""
@@ -66,6 +66,7 @@ _LONG: Final = 8
 _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00")
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?([eE][-+]?\d+)?|true|false")
 _CODE: Final = re.compile(r"[a-z0-9-]+")
+_HASH: Final = re.compile(rf"{WITHHELD}, SHA-256 [0-9a-f]{{16}}")
 _VERSION: Final = re.compile(r"\d+(\.\d+){1,3}([.+-]?[A-Za-z]\w*)*")
 _NAME: Final = re.compile(r"[\w.-]*[A-Za-z][\w.-]*")
 _AT: Final = r"@(?=[A-Za-z\[]|\d+\.\d+\.\d)"
@@ -127,7 +128,8 @@ class Words:
         if not isinstance(value, str) or not value:
             return value
         if key in HASHED:
-            return f"{WITHHELD}, SHA-256 {sha256(value.encode()).hexdigest()[:16]}"
+            hashed = f"{WITHHELD}, SHA-256 {sha256(value.encode()).hexdigest()[:16]}"
+            return value if _HASH.fullmatch(value) else hashed
         return self.cleaned(value) if shared else WITHHELD
 
     def column(self, name: str, values: Sequence[str | None]) -> list[str]:

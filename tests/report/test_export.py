@@ -21,7 +21,7 @@ from s2a_bench.experiments import experiment_of
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.compare.agreement import differences
 from s2a_bench.report.export import HIDDEN, Words, check_folder, write_exports
-from s2a_bench.store.export import WITHHELD
+from s2a_bench.store.export import KEY, WITHHELD
 from s2a_bench.store.manifest import SWEEP
 from s2a_bench.store.requests import TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
@@ -132,6 +132,27 @@ def test_two_exports_are_equal_byte_by_byte(run: StoredRun, tmp_path: Path) -> N
     assert folder.name == f"{run.manifest['started'][:19].replace('-', '').replace(':', '')}Z-latency"
 
 
+def test_an_export_of_an_export_is_the_same(run: StoredRun, tmp_path: Path) -> None:
+    exported(exported(run, tmp_path / "one"), tmp_path / "two")
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+
+
+SHARED = [
+    path.parent
+    for path in sorted((ROOT / "results/reference").glob("**/manifest.json"))
+    if KEY in json.loads(path.read_text())
+]
+
+
+@pytest.mark.parametrize("folder", SHARED, ids=lambda path: str(path.relative_to(REFERENCE)))
+def test_a_reference_result_of_others_is_an_export_as_it_was_written(folder: Path, tmp_path: Path) -> None:
+    """What docs/share.md promises of every folder that a pull request adds."""
+    again = exported(read_run(folder), tmp_path)
+    jsonschema.validate(again.manifest, SCHEMA)
+    assert again.manifest["state"] == "finished"
+    assert content(again.path) == content(folder)
+
+
 def test_a_sweep_is_exported_as_its_finished_runs(make_run: MakeRun, tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, SWEEP, {"configuration": {"command": "latency"}}, (CELLS,)) as sweep:
         for place in range(3):
@@ -203,7 +224,7 @@ RICH = json.loads((REFERENCE / "bench-llama/manifest.json").read_text()) | {
 }
 
 
-@settings(max_examples=200, deadline=None)
+@settings(deadline=None)
 @given(texts=st.lists(TEXTS, min_size=1, max_size=3))
 def test_no_place_and_no_name_stays_in_a_text(texts: list[str]) -> None:
     words = Words({"host": "lab-robot-7", "environment": {"host": "hal9"}, "argv": ["/home/alice/x", *texts]})
