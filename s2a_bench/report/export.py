@@ -7,7 +7,6 @@ texts; equal ones have equal placeholders, so rows and manifest still fit.
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 import socket
@@ -25,7 +24,7 @@ from s2a_bench.machine.resources import SPENT
 from s2a_bench.provenance import Provenance
 from s2a_bench.store import files
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.export import FORMAT, KEY, WITHHELD, ExportedFile, ExportedRun, tables_in
+from s2a_bench.store.export import FORMAT, KEY, TABLE, WITHHELD, ExportedFile, ExportedRun, tables_in
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.store.sweep import is_sweep, read_sweep
@@ -45,8 +44,8 @@ TEXTS: Final = frozenset(_TEXTS.split())
 """The keys whose text leaves, alone or in a list."""
 MAPS: Final = frozenset({"stages", "service", "variants"})
 """The keys of mappings whose texts leave."""
-HASHED: Final = frozenset({"prompt", "grammar"})
-"""The keys of texts of which a checksum leaves, as runs with different ones are not alike."""
+HASHED: Final = frozenset({"prompt"})
+"""The keys of texts whose checksum leaves, as runs with different ones are not alike."""
 _COLUMNS: Final = """
 cell pipeline variant payload connection engine mode size request_id used_by marks facts policy board title study
 simulator follower gap_behaviour outcome phase source verdict limit rule latency rounding duration family reader
@@ -99,7 +98,7 @@ class Words:
             names |= {*_NAME.findall(text)} if key == "host" else set()
         plain = _plain()
         names |= {name.partition(".")[0] for name in names}
-        names = {name for name in names if len(name) > 1 and name.lower() not in plain}
+        names = {name for name in names if len(name) > 1 and _NAME.search(name) and name.lower() not in plain}
         patterns = sorted(map(_pattern, names), key=lambda pattern: (-len(pattern), pattern))
         self._names = re.compile("|".join(patterns) or r"(?!)", re.IGNORECASE)
         self._all = re.compile("|".join((*_PLACES, *patterns)), re.IGNORECASE)
@@ -240,13 +239,13 @@ def _write(run: StoredRun, manifest: dict[str, Any], words: Words, target: Path)
     for stem, source in sorted(sources.items()):
         batches = files.read_texts(run.path / source)
         columns = [name for name in next(batches) if name.isidentifier() and words.cleaned(name) == name]
-        if PROVENANCE not in columns or not stem.isidentifier() or words.cleaned(stem) != stem:
-            continue  # not a table of a run
         path = target / f"{stem}.csv"
+        if PROVENANCE not in columns or not TABLE.fullmatch(path.name) or words.cleaned(stem) != stem:
+            continue  # not a table of a run
         with path.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
+            file.write(files.record(columns))
             for batch in batches:
-                writer.writerows(zip(*(words.column(name, batch[name]) for name in columns), strict=True))
+                rows = zip(*(words.column(name, batch[name]) for name in columns), strict=True)
+                file.writelines(map(files.record, rows))
         manifest[KEY]["files"][path.name] = asdict(ExportedFile.of(path))
     manifests.write(target, manifest)

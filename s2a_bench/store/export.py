@@ -25,7 +25,8 @@ WITHHELD: Final = "withheld"
 """What stands in an exported run for a text that is not shared."""
 Format: TypeAlias = Literal["s2a-bench-export/1"]
 FORMAT: Final[Format] = "s2a-bench-export/1"
-_TABLE: Final = re.compile(r"[a-z][a-z0-9_]*\.csv")
+TABLE: Final = re.compile(r"[a-z][a-z0-9_]*\.csv")
+"""The name of a table's file."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Export:
     """The version of this format, and the tables beside the manifest."""
 
     schema: Format
-    files: Annotated[dict[str, ExportedFile], Facts(propertyNames={"pattern": f"^{_TABLE.pattern}$"})]
+    files: Annotated[dict[str, ExportedFile], Facts(propertyNames={"pattern": f"^{TABLE.pattern}$"})]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +108,7 @@ def check(folder: Path, manifest: Mapping[str, Any]) -> None:
         where = ".".join(map(str, (KEY, *error.errors()[0]["loc"])))
         raise StoreError(f"{folder / NAME} is damaged: {where[:80]}: {error.errors()[0]['msg']}") from None
     for path in (folder / name for name in sorted({*files, *tables_in(folder)})):
-        if (listed := files.get(path.name)) is None or not _TABLE.fullmatch(path.name):
+        if (listed := files.get(path.name)) is None or not TABLE.fullmatch(path.name):
             raise StoreError(f"{path} is not among the files of {folder / NAME}: remove it, or fetch the folder again")
         try:
             same = path.stat().st_size == listed.bytes and ExportedFile.of(path) == listed

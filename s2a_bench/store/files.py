@@ -45,7 +45,7 @@ class CsvFile:
 
     def append(self, table: Table[Row], rows: Iterable[Row], provenance: Callable[[Row], str]) -> None:
         """Write rows in one system call, each with its ``provenance``."""
-        self._write("".join(",".join(map(_field, table.values(row, provenance(row)))) + "\n" for row in rows))
+        self._write("".join(record(table.values(row, provenance(row))) for row in rows))
 
     def close(self) -> None:
         self._file.close()
@@ -62,6 +62,11 @@ class CsvFile:
             self._file.seek(self._end)
             raise StoreError(f"cannot write {self.path}: {why(error, self.path)}; samples so far are kept") from error
         self._end += len(data)
+
+
+def record(values: Iterable[Value]) -> str:
+    """Return a record of a CSV file."""
+    return ",".join(map(_field, values)) + "\n"
 
 
 def _field(value: Value) -> str:

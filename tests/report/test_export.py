@@ -174,6 +174,12 @@ def test_servers_at_two_addresses_stay_two_cells(tmp_path: Path) -> None:
     assert cells.nunique() == 2
 
 
+def test_a_line_end_in_a_text_stays_in_its_row(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", MANIFEST) as run:
+        run.sample(row_of('a "b",\r\nc\r', {"capture": 1, "return": 1}, 1))
+    assert [*exported(read_run(run.path), tmp_path / "shared").samples["cell"]] == ['a "b",\r\nc\r']
+
+
 def test_a_host_named_like_a_word_of_the_harness_changes_no_cell(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(n=2, manifest={**MANIFEST, "host": "ros", "environment": {"host": "network"}})
     assert exported(run, tmp_path / "shared").samples["cell"].equals(run.samples["cell"])
