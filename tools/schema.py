@@ -1,4 +1,4 @@
-"""Write docs/schema/*.json from the classes that ``--json`` objects are made of.
+"""Write docs/schema/*.json from the classes that ``--json`` objects and exported manifests are made of.
 
 `.venv/bin/python tools/schema.py`. Pydantic writes the schema of each dataclass: an object without further keys, its
 docstring the description; `Annotated[type, Facts(...)]` adds bounds and descriptions; a field with a default may be
@@ -31,6 +31,7 @@ from s2a_bench.inference.model_list import ListedModel
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
+from s2a_bench.store.export import ExportedRun
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.sweep.json import PlannedCell, SweptCell
 from s2a_bench.writers.json import RatioJson
@@ -146,6 +147,7 @@ CELLS = [resolve_name(each.cell) for _, each in sorted(EXPERIMENTS.items()) if e
 CLASSES: dict[str, list[Any]] = {
     "s2a-bench-1": [*CELLS, PlannedCell, SweptCell, RatioJson, RunWarning, Origins, Reference, CcrbStudy],
     "s2a-bench-compare-1": [CompareJson],
+    "s2a-bench-export-1": [ExportedRun],
     "s2a-bench-model-1": [FetchedFile, ListedModel],
     "s2a-bench-profile-1": [BoardFacts, ProfileJson],
 }

@@ -74,11 +74,13 @@ compare = command(_compare, CompareConfig)
 
 
 def _report(config: ReportConfig) -> None:
+    from s2a_bench.report.export import write_exports
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
 
     page = make_report(read_chapters(config.runs, against=config.against), against=config.against)
     written = write_report(page, config)
+    shared = write_exports(config.runs, config.export) if config.export else []
     of_chapters = (f"{chapter.title}: {caveat}" for chapter in page.chapters for caveat in chapter.every_caveat)
     for caveat in (*page.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
@@ -90,6 +92,8 @@ def _report(config: ReportConfig) -> None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
             print_line(f"{what}: {path}{count}")
+    for folder in shared:
+        print_line(f"run to share: {folder}")
     whole = [chapter for chapter in page.chapters if chapter.manifest.get("state") == "finished"]
     print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 

@@ -45,7 +45,7 @@ class CsvFile:
 
     def append(self, table: Table[Row], rows: Iterable[Row], provenance: Callable[[Row], str]) -> None:
         """Write rows in one system call, each with its ``provenance``."""
-        self._write("".join(",".join(map(_field, table.values(row, provenance(row)))) + "\n" for row in rows))
+        self._write("".join(record(table.values(row, provenance(row))) for row in rows))
 
     def close(self) -> None:
         self._file.close()
@@ -64,6 +64,11 @@ class CsvFile:
         self._end += len(data)
 
 
+def record(values: Iterable[Value]) -> str:
+    """Return a record of a CSV file."""
+    return ",".join(map(_field, values)) + "\n"
+
+
 def _field(value: Value) -> str:
     if value is None:
         return ""
@@ -75,6 +80,10 @@ def _field(value: Value) -> str:
 
 VALUES: Final = 500_000_000
 """Limit on the values (rows times columns) read of a Parquet file: a few bytes can encode any number of equal ones."""
+
+
+HEADER_LETTERS: Final = 1 << 16
+"""Limit on the header of a CSV file."""
 
 
 def _arrow(path: Path) -> tuple[Any, Any, Any]:
@@ -172,11 +181,7 @@ def read_parquet(path: Path, columns: dict[str, Kind]) -> pd.DataFrame:
     schema = _schema(pa, columns)
     categories = [name for name, kind in columns.items() if kind == "category"]
     with _undamaged(path, pa), parquet.ParquetFile(path, read_dictionary=categories) as file:
-        if (rows := file.metadata.num_rows) * len(columns) > VALUES:
-            raise StoreError(
-                f"{path} has {rows} rows of {len(columns)} columns; at most {VALUES} values are read; "
-                "remove it to read the CSV"
-            )
+        rows = _bounded(path, file.metadata.num_rows, len(columns))
 
         def read(column: Any) -> pd.DataFrame:
             table = file.read([column.name])
@@ -186,6 +191,33 @@ def read_parquet(path: Path, columns: dict[str, Kind]) -> pd.DataFrame:
             return to_pandas(table)
 
         return pd.concat(map(read, schema), axis=1)
+
+
+def _bounded(path: Path, rows: int, columns: int) -> int:
+    """Return the number of rows; raises StoreError for too many values."""
+    if rows * columns > VALUES:
+        raise StoreError(
+            f"{path} has {rows} rows of {columns} columns; at most {VALUES} values are read; remove it to read the CSV"
+        )
+    return rows
+
+
+def read_texts(path: Path) -> Iterator[dict[str, list[str | None]]]:
+    """Yield all columns of a Parquet or CSV file as text: first without rows, then some rows at a time."""
+    pa, _, parquet = _arrow(path)
+    if path.suffix == ".parquet":
+        with _undamaged(path, pa), parquet.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            _bounded(path, file.metadata.num_rows, len(names))
+            yield {name: [] for name in names}
+            for batch in file.iter_batches():
+                yield {name: column.cast(pa.string()).to_pylist() for name, column in zip(names, batch, strict=True)}
+        return
+    with path.open(encoding="utf-8", errors="replace") as file:
+        names = file.readline(HEADER_LETTERS).strip().split(",")
+    yield {name: [] for name in names}
+    for batch in read_csv(path, dict.fromkeys(names, "string")).to_batches(max_chunksize=1 << 16):
+        yield batch.to_pydict()
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, final
 
 from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.provenance import Origins
-from s2a_bench.store import files
+from s2a_bench.store import export, files
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.schema import PROVENANCE, SCHEMA, Kind, Row, Table
@@ -282,9 +282,11 @@ class StoredRun:
 
 
 def read_run(path: Path) -> StoredRun:
-    """Open a run folder for reading; raises StoreError if it is not one, or of another version."""
+    """Open a run folder for reading; raises StoreError if it is not one, of another version, or an export that changed."""
     path = Path(path)
-    return StoredRun(path, manifests.read(path))
+    manifest = manifests.read(path)
+    export.check(path, manifest)
+    return StoredRun(path, manifest)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from s2a_bench.store.export import WITHHELD
 from s2a_bench.store.run import StoredRun
 from s2a_bench.text import dotted
 
@@ -90,12 +91,14 @@ def as_line(every: Sequence[Difference]) -> str:
 def _differing(
     prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fatal: bool
 ) -> Iterator[Difference]:
-    """Yield the facts that differ; an empty and an absent one are equal."""
+    """Yield the facts that differ; an empty and an absent one are equal, a withheld one is like any."""
     for name in dict.fromkeys((*first, *second)):
         one, two = first.get(name), second.get(name)
         if one == two or not (one or two):
             continue
         baseline, other = (_ABSENT if side is None else str(side) for side in (one, two))
+        if (WITHHELD in baseline) != (WITHHELD in other):
+            continue
         known = name in first and name in second
         yield Difference(f"{prefix}{name}", baseline, other, fatal and known)
 

@@ -22,11 +22,13 @@ class ReportConfig(Options):
     latex: Path | None = option(None, "folder for LaTeX tables (booktabs) and figures as PDF")
     csv: Path | None = option(None, "folder for CSV tables with every digit")
     markdown: Path | None = option(None, "all tables as one Markdown file")
+    export: Path | None = option(None, "folder for runs to share: no host names, user names or paths")
     against: str = against("add {}'s claims, each with a verdict and its evidence")
 
     @property
     def page(self) -> Path | None:
-        return self.output if self.output or self.latex or self.csv or self.markdown else Path("report.html")
+        others = self.latex or self.csv or self.markdown or self.export
+        return self.output if self.output or others else Path("report.html")
 
     def check(self) -> None:
         """Raise UsageError if an output would overwrite a file that no report wrote."""
@@ -37,6 +39,10 @@ class ReportConfig(Options):
         for name, path in (("latex", self.latex), ("csv", self.csv)):
             if path is not None and path.exists() and not path.is_dir():
                 raise UsageError(f"`{name}`: {path} is a file; name a folder")
+        if self.export is not None:
+            from s2a_bench.report.export import check_folder
+
+            check_folder(self.export)
 
 
 def _check_file(field: str, path: Path) -> None:
