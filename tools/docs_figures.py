@@ -1,4 +1,4 @@
-"""Draw the figures of docs/{policies,timeline,boundary,chunks,ccrb}.md: `.venv/bin/python tools/docs_figures.py`.
+"""Draw figures of docs/{policies,timeline,boundary,chunks,capacity,ccrb}.md: `.venv/bin/python tools/docs_figures.py`.
 
 They come from runs in virtual time with fixed seeds, so that running this again changes no figure. Those of the
 studies are drawn by `python -m studies figures`.
@@ -23,10 +23,13 @@ from s2a_bench.experiments.ccrb.run import run_closed_loop
 from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.figures import policy_colours
+from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
+from s2a_bench.plugins.chunks.capacity.predict import run_predicted
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.progress import NullProgress
 from s2a_bench.scenario import SIMULATORS, DriveCommand
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.writers.figures import new_figure
@@ -44,35 +47,19 @@ SPREAD = "lognormal:mean_ms=80,cv=0.5"
 SLOW_ONES = "bimodal:mean_ms=80,cv=0.2,pause_share=0.05,pause_ratio=3"
 
 
-class Quiet:
-    """Progress without output."""
-
-    def opened(self, folder: Path) -> None:
-        """Do nothing."""
-
-    def stage(self, text: str) -> None:
-        """Do nothing."""
-
-    def expect(self, samples: int) -> None:
-        """Do nothing."""
-
-    def advance(self) -> None:
-        """Do nothing."""
-
-
 def timelines(config: TimelineComputed) -> Figure:
     """Draw a timeline run."""
-    return drawn(_run(lambda output: run_timeline(config, output, Quiet())), "timeline")
+    return drawn(_run(lambda output: run_timeline(config, output, QUIET)), "timeline")
 
 
 def boundary(config: BoundaryConfig) -> Figure:
     """Draw a boundary run."""
-    return drawn(_run(lambda output: run_boundary(config, output, Quiet())), "boundary")
+    return drawn(_run(lambda output: run_boundary(config, output, QUIET)), "boundary")
 
 
 def chunks(latency: str) -> StoredRun:
     """Make a run of chunks, four modes and the rules."""
-    return _run(lambda output: run_virtual(ChunksVirtual(latency=latency, shown_ticks=90), output, Quiet()))
+    return _run(lambda output: run_virtual(ChunksVirtual(latency=latency, shown_ticks=90), output, QUIET))
 
 
 def safe_start_figure() -> Figure:
@@ -122,6 +109,7 @@ def windscreen_figure() -> Figure:
     return figure
 
 
+QUIET = NullProgress()
 RUNS = TemporaryDirectory()
 """Where runs are until all is drawn: their tables are read when they are needed."""
 
@@ -147,7 +135,10 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "windscreen": windscreen_figure,
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
-    "closed-loop": lambda: drawn(_run(lambda output: run_closed_loop(CcrbClosedLoop(), output, Quiet())), "scenario"),
+    "capacity": lambda: drawn(
+        _run(lambda output: run_predicted(CapacityPredicted(predict="25"), output, QUIET)), "capacity"
+    ),
+    "closed-loop": lambda: drawn(_run(lambda output: run_closed_loop(CcrbClosedLoop(), output, QUIET)), "scenario"),
     "chunks-lanes": lambda: drawn(chunks(SPREAD), "lanes"),
     "chunks-stability": lambda: drawn(chunks(SPREAD), "stability"),
     "chunks-triggers": lambda: drawn(chunks(f"{SPREAD},{SLOW_ONES}"), "triggers"),
