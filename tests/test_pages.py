@@ -74,7 +74,7 @@ def test_no_line_of_a_page_is_long(page: Path) -> None:
 @pytest.mark.parametrize("page", EXPLAINED, ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_page_begins_with_its_example(page: Path) -> None:
     lines = page.read_text(encoding="utf-8").splitlines()
-    (first, *_) = (number for number, line in enumerate(lines, 1) if line.startswith(("```", "![")))
+    (first, *_) = (number for number, line in enumerate(lines, 1) if line.startswith(("```", "![", "    ")))
     before = lines[:first]
     assert first <= FIRST
     assert sum(line.startswith("|") for line in before) <= 9 + 2, "a table of more than 9 rows"
