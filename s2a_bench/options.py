@@ -183,7 +183,8 @@ def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
 def _line(error: ErrorDetails, options: type[Options]) -> str:
     field = str(error["loc"][0]) if error["loc"] else ""
     if error["type"] == "extra_forbidden":
-        return f"`{field}` is none of the options {', '.join(options.model_fields)}{like(field, options.model_fields)}"
+        names = options.model_fields
+        return f"`{field}` is not one of the options {', '.join(names)}{like(field, names)}"
     if error["type"] == "missing":
         return f"`{field}` is needed"
     if error["type"] == "too_short":
@@ -195,9 +196,9 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
 
 
 def need_program(field: str, path: Path) -> None:
-    """Raise UsageError if the path of a field is no program that can be run."""
+    """Raise UsageError if the path of a field is not an executable program."""
     if not (path.is_file() and os.access(path, os.X_OK)):
-        raise UsageError(f"`{field}`: {path} is no program that can be run")
+        raise UsageError(f"`{field}`: {path} is not an executable program")
 
 
 def listed(value: Any) -> tuple[Any, ...]:

@@ -209,7 +209,7 @@ def from_table(table: Mapping[str, Any], mean_s: float, where: str = "") -> Gaps
     """
     name = table.get("family")
     if not isinstance(name, str) or name not in FAMILIES:
-        raise UsageError(f"{where}family: {name!r} is none of {', '.join(FAMILIES)}")
+        raise UsageError(f"{where}family: {name!r} is not one of {', '.join(FAMILIES)}")
     family = FAMILIES[name]
     keys = [field.name for field in fields(family) if field.name != "mean_s"]
     values = {key: value for key, value in table.items() if key != "family"}

@@ -73,7 +73,7 @@ def family(written: str) -> Gaps:
     name = table["family"]
     mean_ms = table.pop("mean_ms", None)
     if name not in (known := (*FAMILIES, "bimodal")):
-        raise UsageError(f"`latency`: '{name}' is none of the families {', '.join(known)}{like(str(name), known)}")
+        raise UsageError(f"`latency`: '{name}' is not one of the families {', '.join(known)}{like(str(name), known)}")
     if not isinstance(mean_ms, int | float) or not 0 < mean_ms <= LONGEST_MS:
         raise UsageError(f"`latency`: {written}: mean_ms should be above 0 and at most {LONGEST_MS:g}, as in {EXAMPLE}")
     if name == "bimodal":
@@ -113,7 +113,7 @@ def _latency(row: Mapping[str, str], latency_of: Callable[[Mapping[str, str]], f
     try:
         latency_ns = latency_of(row)
     except (TypeError, ValueError):
-        raise UsageError(f"{where}: the latency is no number") from None
+        raise UsageError(f"{where}: the latency is not a number") from None
     if not (math.isfinite(latency_ns) and 0 <= latency_ns <= LONGEST_MS * 1e6):
         raise UsageError(f"{where}: a latency of {latency_ns:g} ns should be between 0 and an hour")
     return round(latency_ns)

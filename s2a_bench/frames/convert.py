@@ -154,7 +154,7 @@ def _decode(data: BytesLike, flags: int) -> Pixels:
     try:
         picture = cv2.imdecode(buffer, flags) if buffer.size else None
     except cv2.error as error:
-        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read: {error.err}") from error
+        raise ValueError(f"the {buffer.size} bytes are not a picture that OpenCV can read: {error.err}") from error
     if picture is None:
-        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read")
+        raise ValueError(f"the {buffer.size} bytes are not a picture that OpenCV can read")
     return cast("Pixels", picture)

@@ -255,7 +255,7 @@ class SampleGuard:
 
     def _odd_facts(self) -> list[RunWarning]:
         where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in self._odd.items() if odd)
-        what = f"a server reported facts that are no number, or an impossible one ({where})"
+        what = f"a server reported facts that are not numbers, or impossible ones ({where})"
         advice = "these facts are absent where they were odd: report it to the operator of the server"
         return [RunWarning("odd-facts", what, advice)] if where else []
 

@@ -32,7 +32,7 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
             others.append((parameter, text))
             continue
         if parameter not in types or parameter in values:
-            wrong = "is given twice" if parameter in values else "is no parameter"
+            wrong = "is given twice" if parameter in values else "is not a parameter"
             meant = "" if parameter in values else like(parameter, types)
             raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}{meant}")
         values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", known)

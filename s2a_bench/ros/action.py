@@ -234,7 +234,7 @@ class ClientAction:
         if version := ros.version_of(self._goals.hashed_type, announced):
             return version
         raise TransportError(
-            f"the server's {self._type} has type hash {announced}: its llama_msgs is none of {', '.join(ros.VERSIONS)}"
+            f"the server's {self._type} has type hash {announced}, not that of llama_msgs {', '.join(ros.VERSIONS)}"
         )
 
     def pack(self, goal: Any) -> bytearray:

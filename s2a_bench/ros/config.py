@@ -62,7 +62,7 @@ def static_peers(environ: Mapping[str, str]) -> list[str]:
     peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not PEER.fullmatch(peer):
-            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is no host name or address; separate several with ';'")
+            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is not a host name or address; separate several with ';'")
     return peers
 
 

@@ -248,7 +248,7 @@ def deserialise(cdr: memoryview, type_name: str, version: str = DEFAULT_VERSION)
     try:
         return typestore(version).deserialize_cdr(cdr, type_name)
     except Exception as error:  # rosbags' generated code raises whatever its parsing runs into
-        raise TransportError(f"received bytes that are no {type_name}: {error}") from error
+        raise TransportError(f"received bytes that are not a {type_name}: {error}") from error
 
 
 int64_array = partial(np.fromiter, dtype=np.int64)
@@ -296,7 +296,7 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
     refuse_depth(encoding)
     channels = CHANNELS.get(encoding)
     if channels is None:
-        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is none of {', '.join(CHANNELS)}")
+        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is not one of {', '.join(CHANNELS)}")
     if not (image.width and image.height):
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding[:SHOWN]} is empty")
     height = image.height * 3 // 2 if encoding in CHROMA_BELOW else image.height

@@ -100,7 +100,7 @@ def value_of(message: Any) -> Any:
     try:
         kind = Type(message.type)
     except ValueError:
-        raise UsageError(f"{message.type} is no type of a parameter") from None
+        raise UsageError(f"{message.type} is not a type of a parameter") from None
     value: Any = getattr(message, FIELDS[kind]) if kind else None
     return value.tolist() if hasattr(value, "tolist") else value
 

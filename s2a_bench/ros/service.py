@@ -245,7 +245,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         """Answer one request, unless its client has left; what cannot be answered is dropped."""
         try:
             if len(packed) <= service.body_at:
-                raise TransportError(f"{len(packed)} bytes are no request")
+                raise TransportError(f"{len(packed)} bytes are not a request")
             response = service.pack(answer(service.unpack(packed)))
             if service.reaches(caller):
                 service.respond(response, caller)

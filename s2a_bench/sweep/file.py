@@ -59,8 +59,8 @@ RESERVED = {
     "output": "--output of 's2a-bench sweep' names the folder of all cells",
     "json": "the sweep has --json itself",
     "data-only": "cells always keep data only",
-    "help": "it is no setting",
-    "help-all": "it is no setting",
+    "help": "it is not a setting",
+    "help-all": "it is not a setting",
 }
 """Flags that a sweep sets itself -> what to do instead."""
 MOST_CELLS = 100_000
@@ -141,7 +141,7 @@ def _check_excludes(path: Path, excluded: list[dict[str, Any]], axes: dict[str, 
     for pattern in excluded:
         for key, value in pattern.items():
             if key not in axes:
-                raise UsageError(f"{path}: exclude.{key}: it is no axis{like(key, axes)}")
+                raise UsageError(f"{path}: exclude.{key}: it is not an axis{like(key, axes)}")
             for each in _listed(value):
                 if each not in axes[key]:
-                    raise UsageError(f"{path}: exclude.{key}: {each!r} is no value of that axis")
+                    raise UsageError(f"{path}: exclude.{key}: {each!r} is not a value of that axis")

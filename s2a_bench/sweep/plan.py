@@ -70,7 +70,7 @@ def _check_keys(file: SweepFile, command: SweepCommand, setting: Setting) -> Non
             shown = {name for name, kind in command.flags.items() if kind != "hidden"}
             known = sorted({*shown, BOARD}.difference(RESERVED))
             hint = like(key, known) or f"; it has {', '.join(known)}"
-            raise UsageError(f"{file.path}: '{key}' is no flag of s2a-bench {command.name}{hint}")
+            raise UsageError(f"{file.path}: '{key}' is not a flag of s2a-bench {command.name}{hint}")
         if command.flags[key] in {"switch", "toggle"}:
             if not isinstance(value, bool):
                 raise UsageError(f"{file.path}: {key}: {value!r} should be true or false")

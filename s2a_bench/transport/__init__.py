@@ -49,7 +49,7 @@ Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
 
 
 def payload_order(payload: str) -> int:
-    """Return the place of a payload in tables; what is none of `PAYLOADS` comes last."""
+    """Return the place of a payload in tables; unknown payloads come last."""
     return PAYLOADS.index(payload) if payload in PAYLOADS else len(PAYLOADS)
 
 

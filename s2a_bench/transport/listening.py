@@ -124,7 +124,7 @@ def cannot_bind(host: str, port: str, number: int | None, why: str | None) -> Po
 
 
 def check_url(url: str, schemes: Collection[str]) -> None:
-    """Raise ValueError, without a password, for a text that is no URL with one of the schemes."""
+    """Raise ValueError, without a password, for a text that is not a URL with one of the schemes."""
     try:
         address = urlsplit(url)
         valid = address.scheme in schemes and bool(address.hostname) and address.port != 0

@@ -166,9 +166,9 @@ def _standing_for(
     variants = [chosen] if chosen else measured[: None if every else 1]
     for variant in variants:
         if variant not in (transport.variants or ("",)):
-            known = ", ".join(transport.variants) or "none: it has no variants"
+            names = ", ".join(transport.variants) or "variants: it has none"
             meant = like(variant, transport.variants)
-            raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}{meant}")
+            raise UsageError(f"`transport`: '{variant}' is not one of {transport.name}'s {names}{meant}")
         can = transport.capabilities(Choice(options, variant, mode=mode))
         refused = wanted[:1] if strict and can.payloads else ()  # by `require_payload`
         payloads = [each for each in wanted if each in can.payloads] or refused or can.payloads[:1] or ("",)

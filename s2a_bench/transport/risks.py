@@ -31,7 +31,7 @@ def examine(url: str) -> list[Finding]:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port or "PORT"
     except ValueError as error:
-        raise UsageError(f"`url`: that is no URL: {error}") from error
+        raise UsageError(f"`url`: that is not a URL: {error}") from error
     if not host or parts.scheme not in known:
         schemes = ", ".join(f"{scheme}://" for scheme in known)
         without_key = f"{parts.scheme}://{host}" if parts.scheme else url.rpartition("@")[2]

@@ -291,7 +291,7 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
     ("fields", "message"),
     [
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
-        ({"skills": "juggling"}, "`skills`: 'juggling' is none of"),
+        ({"skills": "juggling"}, "`skills`: 'juggling' is not one of"),
         ({"epsilon": 0.05}, "`epsilon`: no policy is calibrated before a live run; it needs `track`"),
         ({"requests": {"requests": 0}}, "`requests`: 0 should be greater than or equal to 1"),
         ({"robot": "call", "policies": ("naive",)}, "`robot`: call: function = '' should look like module:name"),

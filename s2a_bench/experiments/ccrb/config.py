@@ -53,7 +53,7 @@ class CcrbDrives(PolicyOptions):
         whole_s = self.board.prompt_s + self.tokens_per_skill * (self.scenario.n_skills + 1) / self.board.tokens_per_s
         if whole_s > LONG_S:
             raise UsageError(
-                f"{self.PACED_BY}: the whole plan takes {whole_s:.0f} s to arrive, which is no driving; "
+                f"{self.PACED_BY}: the whole plan takes {whole_s:.0f} s to arrive, which is too slow to drive; "
                 f"at most {LONG_S:.0f} s"
             )
 

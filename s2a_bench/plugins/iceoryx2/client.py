@@ -181,7 +181,7 @@ class Iceoryx2Client(Client):
         except ERRORS as error:
             raise self._failed(error) from error
         except (ValueError, KeyError, TypeError, struct.error) as error:
-            raise RequestFailed(f"{self._name} sent what is no answer: {error!r}") from error
+            raise RequestFailed(f"{self._name} sent a malformed answer: {error!r}") from error
 
     def _read_slice(self, data: memoryview, stream: bytearray, bounds: Bounds) -> None:
         """Add a slice of this answer to its stream; raises MessagesLost for one that came too late."""

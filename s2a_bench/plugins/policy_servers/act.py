@@ -113,7 +113,7 @@ class OpenVla(Dialect):
             return Event(finish="stop", facts={ACTION_N: count}, actions=actions)
         action = np.asarray(_arrays_in(message), np.float64)
         if not (action.size and np.isfinite(action).all()):
-            raise ValueError("an action that is no finite numbers")
+            raise ValueError("an action that is not a list of finite numbers")
         return Event(json.dumps(action.tolist()), finish="stop", facts={ACTION_N: float(action.size)})
 
 

@@ -208,7 +208,7 @@ class Template:
         for brace in _IN_TEXT.finditer(text):
             if brace[0] in {"{", "}"}:
                 places = "{image}, {image:1}, {image:0|CHW}, {images}, {state}, {state:0:7}, {prompt}, {session}"
-                self._refuse(path, f"has a brace that is no place: {text!r}; there are {places}, and {{{{ for a brace")
+                self._refuse(path, f"has an unknown place: {text!r}; there are {places}, and {{{{ for a brace")
         known = {**_BRACES, "{session}": self._session}
         return lambda values: _IN_TEXT.sub(lambda brace: known.get(brace[0], values.prompt), text)
 
@@ -246,7 +246,7 @@ class Template:
     def _state(self, path: str, start: str, stop: str) -> _Make:
         first, last = int(start or 0), int(stop) if stop else None
         if last is not None and last <= first:
-            self._refuse(path, f"wants the numbers {first}:{last} of the state, which are none")
+            self._refuse(path, f"wants the numbers {first}:{last} of the state: an empty range")
         self.accepts_state = True
 
         def make(values: _Values) -> Vector:
@@ -279,7 +279,7 @@ def _loads(text: str, name: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_table)
     except ValueError as error:
-        raise UsageError(f"`template` {name}: no JSON: {error}") from error
+        raise UsageError(f"`template` {name}: not JSON: {error}") from error
 
 
 def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -104,7 +104,7 @@ def installed_version(action: Any, type_name: str) -> str:
     for version in ros.VERSIONS:
         if fits(action.Goal, type_name + "_Goal", version):
             return version
-    raise MissingInterface(f"{type_name} of this ROS 2 workspace is none of llama_msgs {', '.join(ros.VERSIONS)}")
+    raise MissingInterface(f"{type_name} of this ROS 2 workspace is not one of llama_msgs {', '.join(ros.VERSIONS)}")
 
 
 def has_action(type_name: str) -> bool:

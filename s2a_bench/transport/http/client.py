@@ -218,7 +218,7 @@ class HttpClient(Client):
                 raise ServerDied(f"the server at {url} has ended: {error}") from error
             raise RequestFailed(f"{url} broke the connection: {error}", starting=True) from error
         except httpx.InvalidURL as error:
-            raise TransportError(f"`url`: '{url}' is no URL: {error}") from error
+            raise TransportError(f"`url`: '{url}' is not a URL: {error}") from error
 
     def close(self) -> None:
         if self._client is not None:

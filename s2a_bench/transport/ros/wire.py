@@ -67,7 +67,7 @@ def pieces_of(message: Any) -> list[Piece]:
     pieces: list[Piece] = []
     for actions in message.actions:
         if not actions.dims or len(actions.values) % actions.dims:
-            raise RequestFailed(f"{len(actions.values)} numbers are no actions of {actions.dims}")
+            raise RequestFailed(f"{len(actions.values)} numbers are not actions of {actions.dims}")
         pieces += actions_of(actions.values.reshape(-1, actions.dims), message.index + len(pieces))
     return pieces
 
@@ -110,4 +110,4 @@ def remote_of(marks: Any) -> Remote:
             provenance=provenance_of(marks.provenance),
         ).check()
     except ValueError as error:
-        raise RequestFailed(f"the server's marks are none: {error}") from error
+        raise RequestFailed(f"the server's marks are malformed: {error}") from error

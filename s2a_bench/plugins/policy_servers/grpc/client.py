@@ -127,7 +127,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
             return RequestFailed(f"{self._url} broke the connection: {why}")
         meaning = {
             grpc.StatusCode.DEADLINE_EXCEEDED: f"was silent for too long: {self._wiring.timeout_s:g} s",
-            grpc.StatusCode.UNIMPLEMENTED: f"is no policy server of lerobot's: {why}",
+            grpc.StatusCode.UNIMPLEMENTED: f"is not a policy server of lerobot's: {why}",
             grpc.StatusCode.RESOURCE_EXHAUSTED: f"answered with more than 4 MiB (see `actions_per_chunk`): {why}",
         }.get(code, f"refused ({code.name}): {why}")
         return RequestFailed(f"{self._url} {meaning}", starting=code is grpc.StatusCode.DEADLINE_EXCEEDED)
@@ -163,5 +163,5 @@ def bytes_in(message: bytes) -> bytes:
     start = next((at + 1 for at, byte in enumerate(message[1:7], 1) if byte < MORE), 0)
     data = message[start:]
     if message_of(data) != message:
-        raise RequestFailed(f"{len(message)} bytes that are no message of lerobot's")
+        raise RequestFailed(f"{len(message)} bytes that are not a message of lerobot's")
     return data

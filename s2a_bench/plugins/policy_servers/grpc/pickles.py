@@ -69,7 +69,7 @@ def chunk_in(data: bytes) -> tuple[float, Numbers]:
         return float(actions[0].timestamp), np.stack(rows)
     except Exception as error:
         why = str(error)[:SHOWN] or type(error).__name__
-        raise RequestFailed(f"{len(data)} bytes that are no chunk of lerobot's: {why}") from error
+        raise RequestFailed(f"{len(data)} bytes that are not a chunk of lerobot's: {why}") from error
 
 
 def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -92,7 +92,7 @@ def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any
             observation[key] = value
         else:
             raise UsageError(
-                f"`template` {template}: {key} is no picture (H, W, 3), no state (D,) and no text, which lerobot takes"
+                f"`template` {template}: {key} must be a picture (H, W, 3), a state (D,) or a text for lerobot"
             )
     features["observation.state"] = {"dtype": "float32", "shape": (len(motors),), "names": [*motors]}
     return observation | motors, features

@@ -54,7 +54,7 @@ def packb(value: Any, *, text_keys: bool = False) -> bytes:
 
 def _packable(value: Any) -> Any:
     if not isinstance(value, (np.ndarray, np.generic)):
-        raise TypeError(f"{type(value).__name__} is none of its types")
+        raise TypeError(f"{type(value).__name__} is not one of its types")
     if value.dtype.kind in UNSAFE:
         raise ValueError(f"arrays of type {value.dtype} do not travel")
     if isinstance(value, np.generic):

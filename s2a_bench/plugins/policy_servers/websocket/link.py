@@ -85,7 +85,7 @@ class Link:
             uri = parse_uri(self._url)
             return socket.create_connection((uri.host, uri.port), timeout_s)
         except (WebSocketException, ValueError) as error:
-            raise TransportError(f"`url`: '{self._url}' is no URL of a WebSocket: {error}") from error
+            raise TransportError(f"`url`: '{self._url}' is not the URL of a WebSocket: {error}") from error
         except OSError as error:
             why = f" within {timeout_s:g} s" if isinstance(error, TimeoutError) else f": {error}"
             raise ServerDied(f"nothing answers at {self._url}{why}") from error
@@ -146,7 +146,7 @@ class Link:
             closed = error.rcvd if isinstance(error, ConnectionClosed) else None
             did = f"closed the connection: {closed}" if closed else f"broke the connection: {why or error}"
             return Broken(f"{self._url} {did[:QUOTED]}", starting=closed is None)
-        return RequestFailed(f"{self._url} is no WebSocket: {str(why or error)[:QUOTED]}")
+        return RequestFailed(f"{self._url} is not a WebSocket: {str(why or error)[:QUOTED]}")
 
     def close(self) -> None:
         """Close in order, for which the server has a second."""

@@ -117,7 +117,7 @@ def _frame(
 
 
 def _decoded(data: bytes, *, text: bool) -> Any:
-    """Read a message: MessagePack, or a text, which may be JSON; None for bytes that are no message."""
+    """Read a message: MessagePack, or a text, which may be JSON; None for bytes that are not a message."""
     if text:
         return loaded(data)
     with suppress(RequestFailed):

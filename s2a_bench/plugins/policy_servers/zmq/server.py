@@ -166,7 +166,7 @@ class ZmqServer:
         if endpoint == layouts.KILL:
             raise RequestFailed("this server is not ended over the network: stop its process")
         known = f"{layouts.GET_ACTION}, {layouts.PING}, {layouts.RESET}, {layouts.MODALITIES}"
-        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is none of {known}")
+        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is not one of {known}")
 
     def _reply(self, envelope: list[bytes], message: bytes | memoryview) -> None:
         """Have the thread that has the ROUTER send a message."""
@@ -210,4 +210,4 @@ def _resolved(host: str) -> str:
     try:
         return host if ":" in host else socket.gethostbyname(host)
     except OSError as error:
-        raise TransportError(f"`host`: '{host}' is no address of this machine: {error}") from error
+        raise TransportError(f"`host`: '{host}' is not an address of this machine: {error}") from error

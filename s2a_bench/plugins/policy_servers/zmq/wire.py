@@ -62,7 +62,7 @@ def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: boo
 
     def plain(value: Any) -> Any:
         if not isinstance(value, np.ndarray):
-            raise TypeError(f"{type(value).__name__} is none of its types")
+            raise TypeError(f"{type(value).__name__} is not one of its types")
         if maps:  # its elements are packed from where they are
             solid = np.ascontiguousarray(value)
             data = solid.reshape(-1).view(np.uint8).data
