@@ -17,7 +17,7 @@ NOT_SENT: Final = "not seen or sent"
 ORIGIN: Final = "Provenance: "
 AT_TAP, AT_TOPICS, RECORDED = "seen at the tap", "seen at the topics", "recorded"
 SEEN: Final = (AT_TAP, AT_TOPICS, RECORDED)
-"""Where tokens of a robot of others were seen, neither by its client nor by its server."""
+"""Observers of another robot's tokens that are neither its client nor its server."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",

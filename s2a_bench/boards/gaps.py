@@ -72,7 +72,7 @@ class Markov:
 
     mean_s: Mean
     cv: Number
-    """Within a state."""
+    """The coefficient of variation within a state."""
     pause_share: Annotated[float, Field(ge=0, le=0.999)]
     """Share of the tokens whose gap is a pause."""
     pause_ratio: Number
@@ -111,7 +111,7 @@ class Bursty:
 
     mean_s: Mean
     cv: Number
-    """Of the long gaps, and of the short ones."""
+    """The coefficient of variation of the long gaps, and of the short ones."""
     burst_tokens: Annotated[int, Field(ge=1)]
     within: Annotated[float, Field(ge=0, le=1)]
     """Mean gap inside a burst / mean of all gaps."""

@@ -28,7 +28,7 @@ EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
 UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
 LONGEST_MS: Final = 3_600_000.0
 SEED: Final = 0
-"""Of every sequence of latencies, so that the option determines all of them."""
+"""The seed of every sequence of latencies, so that the option determines all of them."""
 STRETCH: Final = 65_536
 """Latencies that are drawn together."""
 

@@ -45,7 +45,7 @@ class Profile:
     origin: Literal["paper", "measured"]
     tokens_per_s: float
     prompt_s: float
-    """From the request to the start of decoding: ingest, vision tower and prompt."""
+    """Time from the request to the start of decoding: ingest, vision tower and prompt."""
     prompt_cv: float
     gaps: Gaps
     """The parametric form of the gaps; its mean is 1 / tokens_per_s."""

@@ -99,7 +99,7 @@ class Column:
 
     @property
     def key(self) -> str:
-        """Its key in ``--json``; empty if that lacks it."""
+        """Its key in ``--json``; empty for a column without one."""
         if self.json_key:
             return self.json_key.name
         return self.metric.name if self.metric and not self.as_stored else self.name

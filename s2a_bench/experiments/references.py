@@ -32,9 +32,9 @@ class Reference:
     """The declaration of one reference; what it names as ``module:attribute`` is imported when it is needed."""
 
     title: str
-    """What sentences call it, as "the paper"."""
+    """Its name in sentences, such as "the paper"."""
     source: str
-    """What it is in full, as "the Stream-to-Act paper"."""
+    """Its full name, such as "the Stream-to-Act paper"."""
     bars: Mapping[str, str] = field(default_factory=dict)
     """Name of a figure -> its `GreyBars`."""
     claims: str = ""

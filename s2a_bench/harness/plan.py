@@ -39,7 +39,7 @@ class BlocksPlan:
 
 @dataclass(frozen=True, slots=True)
 class FeedPlan:
-    """Where pictures come from, and how a request gets them."""
+    """The source of pictures, and how a request gets them."""
 
     source: str
     size: tuple[int, int]
@@ -82,19 +82,19 @@ class RunPlan:
     feed: FeedPlan
     request: RequestPlan
     engine: EngineConfig
-    """Of all cells; a cell's name may change some of its options."""
+    """The engine of all cells; a cell's name may change some of its options."""
     tuned: bool
     """Whether this process and the servers keep large blocks of memory for the next picture."""
     timeout_s: float
     deadline_s: float
     wait_s: float
-    """How long an external server may take to start."""
+    """The longest start of an external server."""
     finds_model: bool
     """Whether the model's files are yet to be found."""
     sample_resources_hz: float
     record: Path | None
     namespace: str
-    """Of the recorded topics."""
+    """The namespace of the recorded topics."""
     checks: Mapping[str, str]
     """Code -> the doctor's checks that concern the transports."""
     manifest: Mapping[str, Any]

@@ -54,10 +54,10 @@ class RunningLaunch:
 
     number: int
     plan: RunPlan
-    """With the paths of the model files."""
+    """The run plan, with the paths of the model files."""
     writer: RunWriter
     sessions: Sequence[Session]
-    """In the order of the cells, `Task.clients` of each cell one after the other."""
+    """`Task.clients` sessions for each cell, in the order of the cells."""
     servers: ServerSet
     guard: SampleGuard
     progress: Progress
@@ -105,7 +105,7 @@ def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """How a measuring command differs from others with the same plan."""
+    """The settings of one measuring command; others with the same run plan differ in these."""
 
     command: str
     drive: Callable[[RunningLaunch], None] = in_blocks

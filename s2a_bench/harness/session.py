@@ -84,7 +84,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class RequestContext:
-    """How one request differs from others of the run, and the receivers of its pieces as they arrive."""
+    """The settings of one request that differ from the run's, and the receivers of its pieces as they arrive."""
 
     state: tuple[float, ...] | None = None
     """The robot's; None: a synthetic state."""
@@ -100,7 +100,7 @@ PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
 SMALL = (16, 16)
 LONGEST_PAUSE_S = 4.0
-"""Of the pauses between failures in a row of a server that may be starting, from 1 s before the third on."""
+"""The longest pause after failures in a row of a server that may be starting; the first, after two, is 1 s."""
 KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
@@ -118,14 +118,14 @@ class Session:
     origin: Provenance = UNKNOWN_ORIGIN
     """It is replaced by the provenance that an answer carries."""
     clocks: InitVar[dict[str, Any] | None] = None
-    """What sessions share of other hosts' clocks; see `Surroundings.clock` for none."""
+    """The state of other hosts' clocks that sessions share; see `Surroundings.clock` for None."""
 
     def __post_init__(self, clocks: dict[str, Any] | None) -> None:
         others = (each.clock(self._exchange, clocks) for each in self.request.surroundings)
         self._clock = next(filter(None, others), None)
         self._frames: dict[int, StreamedFrame] = {}
         self._pictures = 0
-        """Of the last request."""
+        """Number of pictures of the last request."""
         self._absent, self.answered = 0, False
         """Failures in a row of a server that may be starting; whether it has answered."""
         self.busy = False

@@ -24,12 +24,12 @@ from s2a_bench.transport.pipeline import Pipeline
 
 CLOCK_STEP_NS = 50_000_000
 LEVEL: Final = 0.01
-"""Of the test for changed delays."""
+"""The significance level of the test for changed delays."""
 SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
 AWAKE_MS = 2.0
-"""How much later than the end of a server's sleep its client sees the first of the answers."""
+"""The longest time from the end of a server's sleep to its first answer at the client."""
 PILE_MS, PILED = 0.5, 0.1
 """The width of the pile at the end of a sleep, and the share of answers in it that raises the warning."""
 
@@ -173,7 +173,7 @@ DOUBTS: Final = (
     *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE),
     *(UNCOUNTED, RECONNECTED, OVERTAKEN, STALE, LOST, FAILED),
 )
-"""In the order of the warnings."""
+"""The conditions, in the order of the warnings."""
 
 
 class SampleGuard:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NoParameters:
-    """Of most engines."""
+    """The parameters of most engines: none."""
 
 
 class Engine(Protocol):
@@ -371,7 +371,7 @@ def chunk(config: EngineConfig, request: Request) -> Iterator[Action]:
 Size: TypeAlias = Literal["tiny", "full"]
 Like: TypeAlias = Literal["minicpm-v-2.6", "qwen2.5-vl-3b", "smolvlm2-500m", "gemma3-4b"]
 Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
-"""Of dummy weights."""
+"""The quantisation of dummy weights."""
 
 
 class FetchConfig(Options):

@@ -52,7 +52,7 @@ CAUTIONS: Final = (*GRID, math.inf)
 AT_ONCE: Final = 512
 """Plans decided at every lambda in one pass, limited by memory."""
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
-"""What epsilon bounds; see the module docstring."""
+"""The quantity that epsilon bounds; see the module docstring."""
 GUARANTEE: Final[Any] = option(
     "high-confidence",
     "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)",

@@ -168,7 +168,7 @@ class ServerGoal(Protocol):
 
     @property
     def size_bytes(self) -> int:
-        """How large its request is: the CDR, or where the middleware keeps none its texts and pixels."""
+        """Return the size of its request: the CDR, or its texts and pixels where the middleware keeps no CDR."""
 
     @property
     def cancel_requested(self) -> bool:
@@ -203,7 +203,7 @@ class ActionServer(Protocol):
     """Offers one action; cancels and results are served by a thread of its own."""
 
     version: str
-    """Of llama_msgs, as in `messages.VERSIONS`."""
+    """The version of llama_msgs, one of `messages.VERSIONS`."""
 
     def next_goal(self, timeout_s: float) -> ServerGoal | None:
         """Wait for the next goal, to accept or reject; None on timeout or after `interrupt`. One thread at a time."""
@@ -220,7 +220,7 @@ class ServiceClient(Protocol):
 
 
 SERVICE_QOS = QoS(depth=10)
-"""What ROS's services have."""
+"""The QoS of ROS's services."""
 
 
 class Middleware(Protocol):
@@ -265,13 +265,13 @@ class Middleware(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MeetingPlace:
-    """Where the nodes of a middleware meet, if they do not find each other; an option or parameter names it."""
+    """The meeting place of a middleware whose nodes do not find each other; an option or parameter names it."""
 
     option: str
     about: str
     """The option's help."""
     title: str
-    """What is there, in a sentence."""
+    """Its name in a sentence."""
     default: str
     check: Callable[[str], object]
     """Raises UsageError for a text that names no place."""
@@ -289,17 +289,17 @@ class MiddlewareKind:
     module: str
     """The top-level module without which it is not installed."""
     way_out: str
-    """What to do then, beside choosing another."""
+    """The advice for a middleware that is not installed, beside choosing another."""
     dds: str
-    """What carries its messages: an RMW or its own name; empty for the library of a sourced ROS 2, which has an RMW."""
+    """The carrier of its messages: an RMW or its own name; empty for the library of a sourced ROS 2, which has one."""
     meeting_place: MeetingPlace | None = None
     against_loss: str = ""
-    """What helps where messages are lost; empty if they are UDP datagrams, for which the DDS in use has an advice."""
+    """The advice for lost messages; empty for UDP datagrams, for which the DDS in use has one."""
     extra: str = ""
     """The extra of s2a-bench that installs it."""
     packages: tuple[str, ...] = ()
     checks: Mapping[str, str] = field(default_factory=dict)
-    """As of a `Transport`, and so are ``packages``."""
+    """The same as `Transport.checks`; ``packages`` too."""
     has_action: str = ""
     """``module:function`` that returns whether an action's type is built, where types come from a workspace."""
 

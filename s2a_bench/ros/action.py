@@ -83,7 +83,7 @@ WAITING_AT_MOST: Final = 1000
 LISTED_ENDED: Final = 64
 """The status array lists all live goals and so many of the latest that ended."""
 FEEDBACK_ID: Final = slice(4, 20)
-"""Where feedback has its goal's id in CDR."""
+"""The bytes of the goal's id in the CDR of feedback."""
 STATUS_ENTRY: Final = struct.Struct("<16s3xiIb")
 """One GoalStatus in little-endian CDR: goal id, seconds, nanoseconds, status; the first goal id needs no padding."""
 

@@ -26,9 +26,9 @@ TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 image, and no lost fragments at 1920x1080."""
 CYCLONE_URI = "CYCLONEDDS_URI"
 CYCLONE, RMW_CYCLONE, RMW_FAST = "cyclonedds", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"
-"""What carries messages: Cyclone DDS from PyPI, and RMWs of an installed ROS 2."""
+"""The carriers of messages: Cyclone DDS from PyPI, and RMWs of an installed ROS 2."""
 DEFAULT_RMW = RMW_FAST
-"""Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""
+"""The RMW of Humble and Jazzy if RMW_IMPLEMENTATION is not set."""
 LARGE_PICTURES = (
     f'<CycloneDDS><Domain id="any"><General>{TUNED_GENERAL}</General>{TUNED_INTERNAL}</Domain></CycloneDDS>'
 )

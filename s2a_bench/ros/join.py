@@ -1,4 +1,4 @@
-"""How a robot, a camera or an ego joins a domain: parameters, of which some are declared by middlewares."""
+"""Parameters with which a robot, a camera or an ego joins a domain; middlewares declare some of them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ else:
 
 @dataclass(frozen=True, slots=True)
 class RosParameters(PlaceParameters):
-    """How to join a domain, the defaults as of the ROS transport; a peer is waited for ``wait_s``."""
+    """Parameters for joining a domain, with the ROS transport's defaults; ``wait_s`` is the longest wait for a peer."""
 
     wait_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
 

@@ -32,7 +32,7 @@ WARNED_AT_MOST: Final = 100
 _log = logging.getLogger(__name__)
 Taken = TypeVar("Taken")
 Caller = TypeVar("Caller")
-"""What a middleware keeps of a request to address its reply."""
+"""The data with which a middleware addresses the reply to a request."""
 
 
 class Waits(Protocol):
@@ -87,7 +87,7 @@ class ServiceSpec:
 class End(Protocol):
     spec: ServiceSpec
     body_at: int
-    """Where bodies begin in the CDR."""
+    """The offset of bodies in the CDR."""
 
     @property
     def hashed_type(self) -> str:

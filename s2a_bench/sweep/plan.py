@@ -1,4 +1,4 @@
-"""From a sweep file to cells: each setting as a command line, in the order in which they run."""
+"""Turns a sweep file into cells: each setting as a command line, in the order in which they run."""
 
 from __future__ import annotations
 

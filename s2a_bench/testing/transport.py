@@ -128,7 +128,7 @@ class TransportSuite:
     """Run by every transport and variant. Name the pipeline, or override `wiring`; set the limits of its protocol."""
 
     name: ClassVar[str]
-    """As in ``--transport``: the transport, perhaps a variant, perhaps options."""
+    """The name in ``--transport``: the transport, perhaps a variant, perhaps options."""
     carries_id_and_limit = True
     carries: ClassVar[frozenset[str]] = frozenset({"grammar", "seed"})
     """The further fields of a request that reach the handler."""
@@ -139,7 +139,7 @@ class TransportSuite:
     burst = 1000
     """Tokens or actions of a long answer."""
     failure = "the engine has had enough"
-    """What a client says of an engine that fails with these words."""
+    """The message of a client whose engine fails with these words."""
 
     @pytest.fixture
     def wiring(self) -> Wiring[Any]:

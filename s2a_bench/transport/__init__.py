@@ -209,7 +209,7 @@ class Choice(Generic[O]):
 
 @dataclass(frozen=True, slots=True)
 class Capabilities(Generic[O]):
-    """What a choice can carry; see the attributes of `Transport`."""
+    """The capabilities of a choice; see the attributes of `Transport`."""
 
     options: O
     """The options as they hold for the variant."""
@@ -219,7 +219,7 @@ class Capabilities(Generic[O]):
     facts: Sequence[Fact]
     """Facts that may come, from an external server too."""
     server: str = ""
-    """Which of the transport's servers serves the variant."""
+    """The name of the transport's server that serves the variant."""
     takes_task: bool = False
     """Whether the server is a policy, whose prompt is a short task, though its answers count as tokens."""
 
@@ -232,17 +232,17 @@ class Urls:
     examine: str = ""
     """``module:function`` for `doctor --url`, see `transport.risks`."""
     unpickles: str = ""
-    """Which of these servers run code that a client sends, as a sentence."""
+    """The servers of these that run code that a client sends, as a sentence."""
     cache_hits: str = ""
     """``module:function`` that returns counter -> cache hits that the server of a wiring has counted so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sleep:
-    """How long a server of others may sleep after each request, unless it was started with care."""
+    """The sleep of an external server after each request, which some of its start options avoid."""
 
     fact: Fact
-    """How long the client waited for an answer, in ms."""
+    """The time that the client waited for an answer, in ms."""
     ms: float
     advice: str
 
@@ -253,11 +253,11 @@ class Transport(Generic[O]):
     name: ClassVar[str] = ""
     options: type[O]
     variants: ClassVar[tuple[str, ...]] = ()
-    """What follows its name, as ``http/binary``; the first is the default."""
+    """The variants that may follow its name, as ``http/binary``; the first is the default."""
     payloads: ClassVar[tuple[str, ...]] = ()
     """Forms of a picture; the first is the default where raw is not possible. Empty where no picture is sent."""
     answer_kinds: ClassVar[tuple[str, ...]] = (TOKENS,)
-    """What answers can consist of: tokens, actions."""
+    """The kinds of answers: tokens, actions."""
     accepts_state: ClassVar[bool] = False
     stages: ClassVar[Mapping[str, str]] = {}
     """Stage -> group (one of `trace.GROUPS`), in addition to `trace.STAGES`."""

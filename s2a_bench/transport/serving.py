@@ -215,7 +215,7 @@ class Exchange:
         self.ends_ns = 0
         """Deadline of the answer on CLOCK_MONOTONIC; set when the request joins the queue."""
         self.held = ExitStack()
-        """What the request holds, its bytes in flight; released before `end`, which may wait."""
+        """The resources of the request, its bytes in flight; released before `end`, which may wait."""
 
     def sent_whole(self) -> None:
         """Mark an answer that is sent as a whole: the time of its later pieces is `inference` too."""

@@ -1,4 +1,4 @@
-"""What surrounds a run of requests, of installed packages alone: a network between its ends, another host's clock.
+"""The surroundings of a run of requests, from installed packages alone: a network between its ends, another clock.
 
 The options of each kind are fields of every configuration of requests. `Surroundings.of` makes of them an object with
 what a run is within; views show what each kind knows of a kept run, within it or not.
@@ -27,10 +27,10 @@ The argument is one of `machine.clocks.WALL_CLOCKS`, by which the server then bo
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """How far the stamps of a report may be off, once they are on this host's clock."""
+    """The error bounds of a report's stamps, once they are on this host's clock."""
 
     error_ns: int
-    """From the last byte packed to the first piece, either way."""
+    """The bound from the last byte packed to the first piece, in both directions."""
     early_ns: int
     late_ns: int
     """From the reception of the frame to the last piece: how much earlier and later the true times may be."""
@@ -50,7 +50,7 @@ class OtherClock(Protocol):
 
 
 class Around:
-    """What surrounds one run while it lasts: nothing."""
+    """The surroundings of one run while it lasts: by default nothing."""
 
     def facts(self, say: Callable[[str], None]) -> Mapping[str, Any]:
         """Return entries of the manifest, before servers start; ``say`` what takes time."""

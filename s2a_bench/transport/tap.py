@@ -1,4 +1,4 @@
-"""What passes between a client and a server of others, read from copies of the bytes that a tap passes on.
+"""Reads the exchanges of a client and an external server from copies of the bytes that a tap passes on.
 
 A transport declares its reader (`Transport.reader`), a subclass of `TapReader`: it finds where requests and answers
 begin and end. It does no I/O, keeps at most `MOST_BYTES` of one message, and may raise anything: the tap goes on.
@@ -12,20 +12,20 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 MOST_BYTES: Final = 64 << 20
-"""Of a message that is decoded."""
+"""The most bytes of a message that is decoded."""
 DECODED_BYTES: Final = 4 << 20
-"""Of an answer in one piece that is decoded."""
+"""The most bytes of an answer in one piece that is decoded."""
 MOST_WAITING: Final = 1000
 """Requests of a connection that wait for their answers."""
 MOST_KINDS: Final = 32
 OTHERS: Final = "others"
 """The kind of all requests after so many kinds."""
 MOST_PIECES: Final = 1 << 20
-"""Of an answer, which need not end."""
+"""The most pieces of an answer, which need not end."""
 LETTERS: Final = 100
-"""Of kinds of exchanges."""
+"""The most letters of an exchange's kind."""
 FAILED: Final = "an error in place of an answer"
-"""What an error becomes: what a server says may have a key or the robot's prompt in it."""
+"""The text of every error: a server's own may contain a key or the robot's prompt."""
 
 
 @dataclass(slots=True, eq=False)
@@ -49,7 +49,7 @@ class Seen:
     pieces_ns: list[int] = field(default_factory=list)
     """When each token or partial action had been passed on; empty for an answer in one piece."""
     infer_ms: float | None = None
-    """What the server says of its inference."""
+    """The time of inference that the server reports."""
     chunk: tuple[int, int] | None = None
     """Actions of the answer, and numbers of each: (H, D)."""
     observation: Any = None

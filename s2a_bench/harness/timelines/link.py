@@ -110,12 +110,12 @@ class ModelLink:
     first: PlanPrompt
     """The prompt of the warm-up requests."""
     robot: str
-    """For the manifest."""
+    """The robot's entry in the manifest."""
     blocks: Iterator[int] = field(default_factory=count)
     learned_ms: list[Floats] = field(default_factory=list)
     """Gaps between tokens of each warm-up, from which policies learn."""
     seen_ms: list[Floats] = field(default_factory=list)
-    """Those of each plan."""
+    """The observed delays of each plan."""
 
     def __post_init__(self) -> None:
         (self.session,) = self.launch.sessions

@@ -19,7 +19,7 @@ from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
 from s2a_bench.types import Frame, Pixels, Vector
 
 CLIENTS: Final = 4
-"""Of a cell, for modes with several concurrent requests."""
+"""The clients of a cell, for acting modes with several concurrent requests."""
 KEEP_S: Final = 0.05
 """Period in which measurements are written while the loop runs."""
 WARM_UP_TICK_NS: Final = 20_000_000

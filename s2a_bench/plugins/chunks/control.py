@@ -30,7 +30,7 @@ RequestChunk: TypeAlias = "Callable[[int, int], None]"
 ENDLESS: Final = 2**62
 """Ticks of a loop that is stopped."""
 HEAD_START_NS: Final = 20_000_000
-"""From `ControlLoop.start` to the first tick."""
+"""Time from `ControlLoop.start` to the first tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

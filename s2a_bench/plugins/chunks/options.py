@@ -43,7 +43,7 @@ def acting_over() -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class ControlPlan:
-    """How robots act: in modes, by their canonical names, under one control clock."""
+    """The acting modes of the robots, by their canonical names, under one control clock."""
 
     setting: ControlSetting
     modes: Mapping[str, Mode]

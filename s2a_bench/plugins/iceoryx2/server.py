@@ -42,7 +42,7 @@ from s2a_bench.types import Piece, Request
 from s2a_bench.vectors import state_of
 
 ALIGNED: Final = iceoryx2.Alignment.new(8)
-"""What is counted in a slice is read and written whole."""
+"""Counters in a slice are read and written whole."""
 
 
 class Iceoryx2Server:

@@ -34,7 +34,7 @@ ANY: Final = "*"
 CAMERAS: Final = 64
 """The most pictures of a template."""
 PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
-"""What may stand before the names of pictures that a server lists (SGLang)."""
+"""Prefixes of the names of pictures that a server lists (SGLang)."""
 
 _PLACE = re.compile(
     r"\{(?:(?P<all>images)|(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
@@ -60,7 +60,7 @@ _Make: TypeAlias = Callable[[_Values], Any]
 
 
 class ExternalServer(toml_file.TomlTable):
-    """How a policy server differs from openpi's, the table `EXTENSION` of a template."""
+    """The differences of a policy server from openpi's: the table `EXTENSION` of a template."""
 
     path: Annotated[str, Field(max_length=200, pattern=r"^(/[\w.~/-]*)?$")] = ""
     """Path of its address, where `url` has none."""

@@ -1,4 +1,4 @@
-"""What all of rclpy's endpoints here share: a node that a thread spins, and waiting for one entity without it.
+"""A node of rclpy that a thread spins, and waiting for one of its entities without that thread.
 
 The thread serves services and the answers to cancels. One SingleThreadedExecutor a node: no callback here ever blocks.
 Topics and actions have consumers that wait for themselves, as `rclpy.wait_for_message` does, because an executor makes

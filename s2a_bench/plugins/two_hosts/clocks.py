@@ -47,11 +47,11 @@ FIRST_PAUSE_NS: Final = 50_000_000
 """Time between these: a second together, which bounds the clocks' rate."""
 BURST: Final = 5
 FLOAT_NS: Final = 1000
-"""What a wall clock loses as a float of ms."""
+"""The rounding of a wall clock as a float of ms."""
 WANDER: Final = 1e-5
 """Rate at which a disciplined wall clock may leave its bound while a reading is fresh."""
 PERIOD_NS: Final = 10**9
-"""Between requests, one burst of exchanges in this time at most."""
+"""The shortest time between two bursts of exchanges, between requests."""
 PATIENCE_S: Final = 3.0
 """Most time in which a program tells the wall clock's error."""
 FRESH_NS: Final = 10**9

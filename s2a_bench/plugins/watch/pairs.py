@@ -1,4 +1,4 @@
-"""Which answer on one topic belongs to which observation on another; no I/O."""
+"""Pairs the answers on one topic with the observations on another; no I/O."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class TopicMessage(NamedTuple):
     at_ns: int
     size: int
     stamp_ns: int | None = None
-    """Of its header; None for a type without one, and for one that was not set."""
+    """The stamp of its header; None for a type without one, and for a stamp that was not set."""
 
 
 class Pairs:

@@ -1,4 +1,4 @@
-"""What a robot sends, in words: the pictures, numbers and texts of a decoded request."""
+"""Describes a decoded request in words: its pictures, numbers and texts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from s2a_bench.transport.pictures import JPEG_QUALITY
 LEAST_SIDE: Final = 16
 """Pixels of an array that counts as a picture."""
 LEAST_LETTERS: Final = 256
-"""Of a text that may be a picture in Base64."""
+"""The least letters of a text that may be a picture in Base64."""
 MOST: Final = 10_000
 """Values of a request that are looked at."""
 FILES: Final = {b"\xff\xd8\xff": "JPEG", b"\x89PNG": "PNG"}

@@ -26,7 +26,7 @@ from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, ser
 from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, ServiceSpec, awaited
 
 CACHED_AT_MOST: Final = 1000
-"""What a latched topic that keeps all keeps."""
+"""The depth of a latched topic with KEEP_ALL."""
 ANSWER_S: Final = 86_400.0
 """A query may wait so long for its reply, as that for a goal's result does; callers wait less."""
 

@@ -25,7 +25,7 @@ SAFETY_M: Final = 2.0
 """Distance to the lead that the start deadline keeps."""
 CAR_WIDTH_M: Final = 2.0
 OUTCOMES: Final = ("none", "front", "rear", "both")
-"""By code: bit 0 is a front impact, bit 1 a rear impact."""
+"""The outcomes by code: bit 0 is a front impact, bit 1 a rear impact."""
 TTC: Final = "s2a-ttc"
 FOLLOWERS: Final[dict[str, str]] = {
     "careful": "s2a_bench.scenario.ccrb.follower:Careful",

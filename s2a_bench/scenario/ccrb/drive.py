@@ -19,7 +19,7 @@ from s2a_bench.scenario.ccrb.outcome import CollisionWatch, Outcomes
 from s2a_bench.scenario.longitudinal import LockStep, Longitudinal, each
 
 NO_LEAD_M: Final = 1e6
-"""At this distance the lead has no effect on the ego."""
+"""A distance at which the lead has no effect on the ego."""
 AFTER_S: Final = 25.0
 """Limit of a roll-out after the end of its plan; nearly all are decided earlier."""
 RECORD_S: Final = 0.01

@@ -30,7 +30,7 @@ HEAD_BYTES: Final = 1 << 20
 PLAIN: Final = re.compile(r"[A-Za-z._-]{0,40}\d{0,2}|v\d\w*")
 """A part of a path that is kept: others may be names of users, or keys."""
 FIRST_MS: Final = PROMPT_MS, METRICS["time_to_first_token_ms"]
-"""What servers report of the time up to the first token."""
+"""The servers' reports of the time up to the first token."""
 FRAMINGS: Final[Mapping[str, Callable[[], Framing]]] = {
     "text/event-stream": ServerSentEvents,
     "application/json": WholeBody,

@@ -35,7 +35,7 @@ from s2a_bench.types import Piece, Request, Sampling, Token
 ACTION = "/generate_response"
 MARKS = "/marks"
 MEDIA_MARKER = "<__media__>"
-"""Where a picture goes in a llama_ros prompt."""
+"""The place of a picture in a llama_ros prompt."""
 MARKS_TIMEOUT_S = 2.0
 NO_SEED = 2**32 - 1
 """SamplingConfig.seed of a client without a wish."""

@@ -34,7 +34,7 @@ FRAME_ID = "camera"
 PIXELS = frozenset({"raw", "yuyv"})
 """Payloads that are sensor_msgs/Image; the others are CompressedImage."""
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
-"""By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
+"""The QoS of ROS 2's profiles, by name; a reliable subscription does not match a best-effort publisher."""
 CLOCK, CLOCK_QOS = "/clock", QoS(depth=1, reliable=False)
 """Simulated time, as a simulator or a replayed recording publishes it."""
 POLL_S = 0.5
@@ -99,7 +99,7 @@ class CachedFrame:
     frame: Frame
     marks: list[Mark]
     count: int
-    """How many frames had arrived with this one."""
+    """The number of frames up to this one."""
 
     @property
     def received_ns(self) -> int:

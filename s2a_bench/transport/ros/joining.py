@@ -23,7 +23,7 @@ from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 T = TypeVar("T")
 AT = "@"
-"""In an address, between the namespace and the meeting place that the server is itself."""
+"""The separator in an address between the namespace and the meeting place that the server hosts itself."""
 MATCH_TIMEOUT_S = 15.0
 SETTLE_S = 0.3
 """Time to discover a server that is there already."""
@@ -111,7 +111,7 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
 
 
 class RosClient(Client):
-    """What the clients of both variants have: a node, the server's camera, and messages that they wait for."""
+    """The base of both variants' clients: a node, the server's camera, and waiting for messages."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the server; raises ServerDied if it does not appear."""

@@ -23,7 +23,7 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 
 
 class DomainOptions(TransportOptions):
-    """Where a server is; the meeting places of middlewares follow."""
+    """The options that locate a server; the meeting places of middlewares follow."""
 
     PANEL: ClassVar[str] = "ROS 2"
 

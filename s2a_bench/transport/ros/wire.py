@@ -1,4 +1,4 @@
-"""What travels beside pictures: requests, tokens and marks as messages of s2a_msgs, and their quality of service."""
+"""The payloads beside pictures: requests, tokens and marks as messages of s2a_msgs, and their quality of service."""
 
 from __future__ import annotations
 

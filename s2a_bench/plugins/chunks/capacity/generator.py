@@ -45,27 +45,27 @@ from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.types import Frame, Piece
 
 STRIDE: Final = 1 << 20
-"""Between the numbers of two requests of a robot, so that those of different robots differ."""
+"""The step between the numbers of a robot's requests, so that those of different robots differ."""
 PATIENCE_S: Final = 2.0
-"""For answers under way when a fleet is stopped by an error."""
+"""Time for running answers when a fleet is stopped by an error."""
 FREE_CORE_S: Final = 60.0
-"""How long a process waits for a core of the cluster."""
+"""The longest wait of a process for a core of the cluster."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetPlan:
-    """What the robots of a fleet have in common; a process gets it as it is."""
+    """The settings that the robots of a fleet share; they are sent to each process."""
 
     cell: str
     wiring: Mapping[str, Any]
-    """As `Wiring.to_json`."""
+    """The result of `Wiring.to_json`."""
     requests: RunPlan
     """Without its cells."""
     load: RobotLoad
     first: int = 0
     """Place in the run before those of its requests."""
     own: Pipeline | None = None
-    """To a server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
+    """The server that each process starts for its own robots; None: all share that of `wiring`."""
     origin: Provenance = UNKNOWN_ORIGIN
 
 
@@ -118,7 +118,7 @@ class Timed:
 
     intended_ns: int
     late_ns: int
-    """Of the generator: after its intended time, or the answer before it; -1: not requested."""
+    """Lateness of the generator, after the intended time or the previous answer; -1: not requested."""
     at_ns: list[int] = field(default_factory=list)
     """Times of its pieces."""
     whole_ns: int = -1

@@ -115,9 +115,9 @@ class _Cell:
     """Opens the robots of a session."""
     session: Session
     instant: Session | None
-    """Of a server that takes no time, with which the generator is checked."""
+    """A session of a server that takes no time, which checks the generator."""
     service: Service | None = None
-    """Of the requests of one robot alone, before any other fleet."""
+    """The service of the requests of one robot alone, before any other fleet."""
     tried: dict[int, Tried] = field(default_factory=dict)
 
     def run(self) -> None:

@@ -39,18 +39,18 @@ MOST_POINTS: Final = 64
 """Triggers that are tried."""
 MEANS_TRIED: Final = 33
 REQUESTS_TRIED: Final = 2000
-"""At each mean."""
+"""The number of simulated requests at each mean."""
 SHARES: Final = np.linspace(0, 1, 401)
 """Quantiles of reaction times that are stored: denser than a figure can show."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActedCell:
-    """What a cell did: by its cycles and by its ticks."""
+    """The cycles and the ticks of a cell."""
 
     cell: ActingCell
     setting: ControlSetting
-    """With actions as slow as the cell's."""
+    """The setting, with actions as slow as the cell's."""
     cycles: Cycles
     ticks: Ticks
     more: Mapping[str, Any] = field(default_factory=dict)

@@ -55,11 +55,11 @@ class ActingCell:
     drawn: LatencyDraw
     triggers: tuple[int, ...] = ()
     slower: float = 1.0
-    """By how many times slower its actions are executed (time-scaling)."""
+    """Factor by which its actions are executed more slowly (time-scaling)."""
     begin: Callable[[], TriggerRule] | None = None
     """Creates the rule that chooses a trigger after the other; None once all are chosen."""
     calibration: Calibration | None = None
-    """What the rule `calibrated` learned."""
+    """The calibration of the rule `calibrated`."""
 
     @property
     def acting(self) -> Mode:

@@ -35,7 +35,7 @@ class RulesPlan:
     epsilon: float
     guarantee: Guarantee
     slowest: float
-    """By how many times a rule may slow actions down."""
+    """The largest factor by which a rule may slow actions down."""
 
     @property
     def promise(self) -> bool:

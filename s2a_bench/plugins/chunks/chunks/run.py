@@ -27,10 +27,10 @@ MOST_TICKS: Final = 100_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualPlan:
-    """What is drawn for a run in virtual time, and what follows."""
+    """The draws of a run in virtual time, and the values derived from them."""
 
     drawn: Sequence[LatencyDraw]
-    """Of each source."""
+    """The draws of each source."""
     cells: Sequence[ActingCell]
     manifest: dict[str, Any]
 

@@ -31,7 +31,7 @@ from s2a_bench.transport.tap import LETTERS, MOST_WAITING, Incoming, ParsedTapRe
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 SEND, GET = f"grpc {SERVICE}SendObservations", f"grpc {SERVICE}GetActions"
 HEADERS_BYTES: Final = 1 << 16
-"""Of a block of headers, and of hpack's table, whatever the peers agreed on."""
+"""The most bytes of a block of headers, and of hpack's table, whatever the peers agreed on."""
 PREFIX: Final = 5
 """Bytes before each message: whether it is compressed, and its size."""
 HEAD: Final = 512
@@ -39,7 +39,7 @@ HEAD: Final = 512
 CHUNK_BYTES: Final = 4 << 20
 """gRPC's own limit of a message."""
 OBSERVATIONS: Final = 100
-"""That wait for a chunk."""
+"""The most observations that wait for a chunk."""
 ERRORS: Final = {str(code.value[0]).encode(): f"gRPC {code.name}" for code in grpc.StatusCode} | {b"0": ""}
 
 

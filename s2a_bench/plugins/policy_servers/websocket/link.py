@@ -27,7 +27,7 @@ QUEUED: Final = 4
 CLOSING_S: Final = 1.0
 QUOTED: Final = 200
 REFUSED: Final = "; refused: a wrong path or a key; see `url` and `api_key_env`"
-"""Of 403 too, with which Starlette answers an unknown path."""
+"""The advice for 401 and 403; Starlette answers an unknown path with 403."""
 
 
 class Broken(RequestFailed):

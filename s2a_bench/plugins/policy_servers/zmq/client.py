@@ -33,7 +33,7 @@ from s2a_bench.types import Frame, Piece, Pixels, Request
 ANSWER_BYTES: Final = 16 << 20
 """Most bytes of an answer; libzmq takes no more."""
 POLL_MS: Final = 20
-"""How often a waiting request checks its connection."""
+"""Interval at which a waiting request checks its connection."""
 KEPT_FILES: Final = 16
 """Most pictures whose memory is kept for the next request."""
 WRONG_POLICY: Final = b"ERROR"

@@ -43,7 +43,7 @@ ONES: Final = ("x", "y", "z", "roll", "pitch", "yaw", "rx", "ry", "rz", "rw", "p
 WIDTHS: Final = {**dict.fromkeys(ONES, 1), "waist": 3, "single_arm": 5, "leg": 6, "arm": 7, "eef_9d": 9}
 """Part of a robot, left as right -> numbers of its state in GR00T's own embodiments; no server tells of them."""
 STATE_AXES, PICTURE_AXES = 2, 4
-"""Of N1.5's arrays without a batch."""
+"""The axes of N1.5's arrays without a batch."""
 
 
 def marked(marks: set[str]) -> str:

@@ -29,7 +29,7 @@ from s2a_bench.transport.serving import RETRY_AFTER_S, Core, SharedSourceWorkers
 from s2a_bench.types import Request
 
 POLL_MS: Final = 100
-"""How long a server that stops may wait for a message."""
+"""The longest wait for a message of a server that stops."""
 QUEUED: Final = 8
 """Messages of one client that libzmq keeps for us; those beyond wait at the client."""
 READING: Final = 16
@@ -37,7 +37,7 @@ READING: Final = 16
 ENVELOPE: Final = 4
 """Frames kept before a message: the identity, those of proxies, an empty one; further ones are discarded."""
 MARKS_AFTER_S: Final = 0.0005
-"""Between an answer and the marks behind it: computed at once they take 0.15 ms from the answer under way."""
+"""Pause between an answer and its marks: computed at once they would take 0.15 ms from the running answer."""
 REPLIES: Final = "inproc://replies"
 
 Send: TypeAlias = Callable[[bytes | memoryview], None]

@@ -20,7 +20,7 @@ from s2a_bench.transport.tap import DECODED_BYTES, FAILED, MOST_BYTES, Incoming,
 MORE, LONG, COMMAND = 1, 2, 4
 """Flags of a frame."""
 MECHANISMS: Final = (b"NULL", b"PLAIN")
-"""Those that do not encrypt what follows, as CURVE does."""
+"""The mechanisms without encryption; CURVE encrypts all that follows."""
 PING: Final = b"\x04PING"
 HEAD: Final = 512
 """Bytes of a request in which its endpoint stands."""

@@ -32,7 +32,7 @@ BEFORE: Final = 128
 """Bytes of the header of a picture, and of most."""
 
 _NUMBERS = re.compile(r"[<>|=](b1|[iu][1248]|f[248])")
-"""What msgpack-numpy calls types of numbers."""
+"""The names of number types in msgpack-numpy."""
 
 
 class PictureFile:

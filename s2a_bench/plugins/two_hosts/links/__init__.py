@@ -36,7 +36,7 @@ SIOCSIFFLAGS, SIOCSIFADDR, SIOCSIFDSTADDR = 0x8914, 0x8916, 0x8918
 RTM_NEWLINK, NLM_F_REQUEST, IFLA_TXQLEN = 16, 1, 13
 IFF_UP: Final = 0x1
 QUEUE_PACKETS: Final = 10_000
-"""Of a device, so that a packet waits for the relay rather than is lost."""
+"""The queue of a device, so that a packet waits for the relay instead of being lost."""
 _libc = ctypes.CDLL(None, use_errno=True)
 
 

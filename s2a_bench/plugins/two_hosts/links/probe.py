@@ -24,7 +24,7 @@ RATE_S: Final = 1.0
 OFFERED: Final = 1.15
 """Offered load over the rate."""
 IP_BYTES, UDP_BYTES, PACKET_BYTES, SMALL_BYTES = 20, 8, 1500, 128
-"""Of headers; of a full packet, and of one of the counts and round trips, headers included."""
+"""The sizes of headers, of a full packet, and of a packet for counts and round trips, headers included."""
 FRAGMENTS: Final = 10
 """Packets of a datagram where none is lost: Python sends some 50,000 datagrams a second."""
 COUNTED: Final = 2000
