@@ -33,10 +33,10 @@ class Options(BaseModel):
     virtual: ClassVar[bool] = False
     """Whether a run computes in virtual time, so that several may share a machine; measuring runs may not."""
 
-    def __init__(self, **given: Any) -> None:
+    def __init__(self, **values: Any) -> None:
         """Raise UsageError, naming the field, for an invalid value."""
         try:
-            super().__init__(**given)
+            super().__init__(**values)
         except ValidationError as error:
             raise UsageError(_line(error.errors()[0], type(self))) from None
 
@@ -149,24 +149,24 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
                 new = [(name, *path) for path in paths if not only or path[0] in only]
                 if not new:
                     continue
-                known = paths_of.setdefault(each, new)
-                if known is not new and beside(known[0], new[0]):
-                    known += new
+                paths_so_far = paths_of.setdefault(each, new)
+                if paths_so_far is not new and beside(paths_so_far[0], new[0]):
+                    paths_so_far += new
     for name, field in options.model_fields.items():
         if group_of(field) is None:
             paths_of |= {name: [(name,)], str(extra_of(field).get("flag") or name).replace("-", "_"): [(name,)]}
     return paths_of
 
 
-def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
+def placed(options: type[Options], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return options, each given by one of its names, as arguments of the class; unknown names stay."""
-    known = places(options)
+    paths = places(options)
 
     def at(name: str, value: Any) -> list[Place]:
         whole = name in options.model_fields and isinstance(value, (Options, dict))
-        return [(name,)] if whole else known.get(name, [(name,)])
+        return [(name,)] if whole else paths.get(name, [(name,)])
 
-    return nested((path, value) for name, value in given.items() for path in at(name, value))
+    return nested((path, value) for name, value in values.items() for path in at(name, value))
 
 
 def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
@@ -217,8 +217,8 @@ def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
 
 def _one_of(names: Callable[[], Iterable[str]], value: Any) -> Any:
     for each in value if isinstance(value, tuple) else (value,):
-        if each not in (known := tuple(names())):
-            raise ValueError(none_of(each, known))
+        if each not in (allowed := tuple(names())):
+            raise ValueError(none_of(each, allowed))
     return value
 
 

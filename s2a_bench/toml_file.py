@@ -118,8 +118,8 @@ def _path(steps: Iterable[int | str], content: Any) -> str:
     """Write a key after its tables; an element of an array appears with its ``name``, if it has one."""
     path = ""
     for step in steps:
-        known = (isinstance(content, Mapping) and step in content) or isinstance(step, int)
-        content = content[step] if known else None
+        has_step = (isinstance(content, Mapping) and step in content) or isinstance(step, int)
+        content = content[step] if has_step else None
         if isinstance(step, int):
             name = content.get("name") if isinstance(content, Mapping) else None
             path += f"[{name if isinstance(name, str) and name.isidentifier() else step}]"

@@ -207,8 +207,8 @@ class Budget:
     @property
     def e2e_without_model_ns(self) -> int | None:
         """Return e2e minus the model's time, or None if the engine does not report its preprocessing."""
-        known = {"preprocess", "inference"} <= self.stages_ns.keys()
-        return self.e2e_ns - self.stages_ns["inference"] if known else None
+        reported = {"preprocess", "inference"} <= self.stages_ns.keys()
+        return self.e2e_ns - self.stages_ns["inference"] if reported else None
 
     @property
     def residual_share(self) -> float | None:

@@ -93,10 +93,10 @@ class Markov:
 
         shape = (tokens, plans)
         redraws = rng.random(shape, np.float32) < 1 / (self.pause_tokens * (1 - self.pause_share))
-        drawn = rng.random(shape, np.float32) < self.pause_share
+        paused = rng.random(shape, np.float32) < self.pause_share
         rows = np.arange(tokens, dtype=np.int32)[:, None]
         last = np.maximum.accumulate(np.where(redraws, rows, np.int32(0)), axis=0)  # the first row counts as drawn
-        pauses = np.take_along_axis(drawn, last, axis=0)
+        pauses = np.take_along_axis(paused, last, axis=0)
         gaps = _lognormal(rng, self.normal_s, self.cv, shape)
         gaps[pauses] *= self.pause_ratio
         return gaps

@@ -72,8 +72,8 @@ def family(written: str) -> Gaps:
     table = read_family(written, "latency")
     name = table["family"]
     mean_ms = table.pop("mean_ms", None)
-    if name not in (known := (*FAMILIES, "bimodal")):
-        raise UsageError(f"`latency`: '{name}' is not one of the families {', '.join(known)}{like(str(name), known)}")
+    if name not in (names := (*FAMILIES, "bimodal")):
+        raise UsageError(f"`latency`: '{name}' is not one of the families {', '.join(names)}{like(str(name), names)}")
     if not isinstance(mean_ms, int | float) or not 0 < mean_ms <= LONGEST_MS:
         raise UsageError(f"`latency`: {written}: mean_ms should be above 0 and at most {LONGEST_MS:g}, as in {EXAMPLE}")
     if name == "bimodal":

@@ -83,9 +83,9 @@ def open_recording(path: str, option: str = "source") -> Any:
 
 def _connection(connections: list[Any], path: str, topic: str) -> Any:
     images = [connection for connection in connections if connection.msgtype in TYPES]
-    chosen = [connection for connection in images if topic in {"", connection.topic}]
-    if chosen:
-        return chosen[0]
+    matches = [connection for connection in images if topic in {"", connection.topic}]
+    if matches:
+        return matches[0]
     names = sorted({connection.topic for connection in images})
     if names:
         raise SourceError(f"`source`: {path} has no image topic {topic}; it has {', '.join(names)}")

@@ -121,10 +121,10 @@ def answered(config: RequestsConfig, say: Callable[[str], None]) -> RequestsConf
         return _without_our_engine(config, say)
     if config.COMPUTES:
         return config
-    chosen = config.but(engine=engine.but(name=engine.default_name(say)))
-    if left_out := {each.name for each in config.pipelines} - {each.name for each in chosen.pipelines}:
+    resolved = config.but(engine=engine.but(name=engine.default_name(say)))
+    if left_out := {each.name for each in config.pipelines} - {each.name for each in resolved.pipelines}:
         say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
-    return chosen
+    return resolved
 
 
 def _without_our_engine(config: RequestsConfig, say: Callable[[str], None]) -> RequestsConfig:
@@ -140,8 +140,8 @@ def _without_our_engine(config: RequestsConfig, say: Callable[[str], None]) -> R
 
 def _is_named(config: RequestsConfig, cell: Pipeline, others: Sequence[Pipeline]) -> bool:
     """Whether the user named a cell, or its transport, of which ``others`` has none."""
-    transport, given = cell.transport.name, "transports" in config.model_fields_set
-    written = {name.partition("?")[0] for name in config.names} if given else set()
+    transport, explicit = cell.transport.name, "transports" in config.model_fields_set
+    written = {name.partition("?")[0] for name in config.names} if explicit else set()
     named = transport in {*written, *config.options.model_fields_set}
     alone = all(each.transport is not cell.transport for each in others)
     return cell.name.partition("?")[0] in written or (named and alone)

@@ -291,8 +291,8 @@ class _Run:
             stack.callback(camera.stop)
         for cell, place in product(self.plan.cells, range(self.task.clients)):
             client = servers.client(cell)
-            made: list[Session] = []
-            clients.callback(_close_idle, client, made)
+            opened: list[Session] = []
+            clients.callback(_close_idle, client, opened)
             feed: Feed
             if camera is not None:
                 random = Random(plan.seed)  # noqa: S311 - phases, not secrets
@@ -302,8 +302,9 @@ class _Run:
                 user = f"{cell.name} {place}" if place else cell.name
                 source = self.sources.of(user, user if cell.black_box or place else "")
                 feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
-            made.append(Session(cell, client, feed, self.plan.request, recorder, sampler, servers.origin(cell), clocks))
-            yield made[0]
+            origin = servers.origin(cell)
+            opened.append(Session(cell, client, feed, self.plan.request, recorder, sampler, origin, clocks))
+            yield opened[0]
 
 
 def _close_idle(client: Client, sessions: Sequence[Session]) -> None:

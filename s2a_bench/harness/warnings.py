@@ -260,8 +260,8 @@ class SampleGuard:
         return [RunWarning("odd-facts", what, advice)] if where else []
 
     def advice(self, cells: Iterable[str]) -> str:
-        known = [self._cells[name] for name in cells if name in self._cells]
-        return "; ".join(dict.fromkeys(cell.transport.against_loss(cell.options) for cell in known))
+        lossy = [self._cells[name] for name in cells if name in self._cells]
+        return "; ".join(dict.fromkeys(cell.transport.against_loss(cell.options) for cell in lossy))
 
     def _correlated(self) -> list[RunWarning]:
         """Check whether neighbouring samples are correlated; intervals over several launches do not depend on it."""

@@ -156,7 +156,7 @@ SAMPLER_ARGUMENTS = {
 LEAST_CONTEXT, LEAST_BATCH, LARGEST = 256, 32, 1 << 20
 
 
-def _known(written: str) -> str:
+def _check_engine(written: str) -> str:
     if (name := written.partition("?")[0]) not in ENGINES:
         raise ValueError(none_of(name, ENGINES))
     return written
@@ -173,7 +173,7 @@ Written = Annotated[str, BeforeValidator(_written, json_schema_input_type=str | 
 class EngineConfig(Options):
     PANEL: ClassVar[str] = "Model"
 
-    name: Annotated[str, AfterValidator(_known)] = option(
+    name: Annotated[str, AfterValidator(_check_engine)] = option(
         MODEL,
         f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED), "
         "call?function=MODULE:NAME is your own",
@@ -285,9 +285,9 @@ def declared_engine(name: str) -> type[Engine]:
 def check_engine(config: EngineConfig) -> None:
     """Raise UsageError for an option of another engine, and for options that contradict each other."""
     for name, kind in ENGINES.loaded():
-        given = next((option for option in kind.exclusive_options if getattr(config, option)), "")
-        if given and name != config.name:
-            raise UsageError(f"`{given}` needs `engine` {name}; `engine` {config.name} answers at its own speed")
+        option_name = next((option for option in kind.exclusive_options if getattr(config, option)), "")
+        if option_name and name != config.name:
+            raise UsageError(f"`{option_name}` needs `engine` {name}; `engine` {config.name} answers at its own speed")
     config.kind.check(config)
 
 

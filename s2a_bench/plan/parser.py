@@ -210,9 +210,9 @@ def _explain(text: str, line: str, format_: Format) -> _Bad:
     skill = next((skill for skill in format_.skills.skills if labels.head(skill) == head), None)
     if skill is None:
         return "unknown-skill", line, f"'{head}' is not one of the skills"
-    for argument, given in zip(skill.arguments, rest, strict=False):
-        if given not in {labels.value(argument.vocabulary, value) for value in argument.values}:
-            return "bad-argument", line, f"'{given}' is not a valid {argument.name} of {skill.name}"
+    for argument, field in zip(skill.arguments, rest, strict=False):
+        if field not in {labels.value(argument.vocabulary, value) for value in argument.values}:
+            return "bad-argument", line, f"'{field}' is not a valid {argument.name} of {skill.name}"
     if len(rest) < len(skill.arguments):
         return "bad-argument", line, f"{skill.name} has {len(skill.arguments)} arguments, {len(rest)} are given"
     return "malformed", line, f"{skill.name} is not written as listed"

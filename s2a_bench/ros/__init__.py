@@ -334,7 +334,7 @@ def default_middleware(environ: Mapping[str, str]) -> str:
     return min(kinds, key=lambda name: bool(kinds[name].dds), default=next(iter(MIDDLEWARES)))
 
 
-def chosen(name: str = "") -> MiddlewareKind:
+def middleware_kind(name: str = "") -> MiddlewareKind:
     """Return the middleware of a name, `default_middleware` without; raises UsageError."""
     return MIDDLEWARES[name or default_middleware(os.environ)]
 

@@ -152,17 +152,17 @@ class Goals:
     def cancel(self, goal_id: bytes, stamp_ns: int) -> tuple[CancelCode, list[Goal]]:
         """Select the goals a cancel request means, make them CANCELING, and return them with the return code."""
         everything = goal_id == ALL_GOALS and not stamp_ns
-        chosen = [
+        goals = [
             goal
             for goal in self._live.values()
             if Status.CANCELING in NEXT[goal.status]
             and (everything or goal.id == goal_id or (stamp_ns and goal.stamp_ns <= stamp_ns))
         ]
-        if not (chosen or everything or stamp_ns):
+        if not (goals or everything or stamp_ns):
             return (CancelCode.GOAL_TERMINATED if self.find(goal_id) else CancelCode.UNKNOWN_GOAL_ID), []
-        for goal in chosen:
+        for goal in goals:
             goal.status = Status.CANCELING
-        return CancelCode.NONE, chosen
+        return CancelCode.NONE, goals
 
     def expire(self, at_ns: int) -> None:
         while self._ended:
@@ -489,12 +489,12 @@ class ServedAction(Generic[Caller]):
 
     def _answer_cancel(self, request: Any, caller: Caller) -> None:
         info = request.goal_info
-        code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.nanoseconds(info.stamp))
-        canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in chosen]
+        code, canceled = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.nanoseconds(info.stamp))
+        canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in canceled]
         reply_type = self._cancel.spec.reply_type
         response = ros.default(reply_type, self.version, return_code=int(code), goals_canceling=canceling)
         self._cancel.respond(self._cancel.pack(response), caller)
-        if chosen:
+        if canceled:
             self._publish_status()
 
 

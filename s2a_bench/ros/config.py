@@ -39,10 +39,10 @@ PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
 multicast alone, as Fast DDS does on a subnet, and starts later than that would never be met on loopback."""
 
 
-def domain_id(environ: Mapping[str, str], chosen: int | None = None) -> int:
+def domain_id(environ: Mapping[str, str], option: int | None = None) -> int:
     """Return the chosen DDS domain, else that of ROS_DOMAIN_ID, else 0; raises UsageError for what is no domain."""
-    if chosen is not None:
-        return chosen
+    if option is not None:
+        return option
     text = environ.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or not 0 <= int(text) <= 232:  # noqa: PLR2004 - the last domain with valid ports
         raise UsageError(f"ROS_DOMAIN_ID: '{text}' is not a number from 0 to 232; unset it or choose one")

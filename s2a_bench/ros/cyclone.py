@@ -72,8 +72,8 @@ class NodeAnnouncement:
 
 
 def _topic_qos(qos: QoS, type_name: str, version: str = DEFAULT_VERSION) -> Qos:
-    known = type_name in ros.typestore(version).fielddefs
-    return dds_qos(qos, f"typehash={type_hash(type_name, version)};" if known else UNTYPED)
+    has_definition = type_name in ros.typestore(version).fielddefs
+    return dds_qos(qos, f"typehash={type_hash(type_name, version)};" if has_definition else UNTYPED)
 
 
 class _CyclonePublisher(RawWriter):
@@ -110,10 +110,10 @@ _domains_lock = Lock()
 def _configure(domain_id: int, xml: str) -> None:
     """Configure a domain once per process; Cyclone takes no second configuration."""
     with _domains_lock:
-        known = _domains.get(domain_id)
-        if known is None:
+        joined = _domains.get(domain_id)
+        if joined is None:
             _domains[domain_id] = (Domain(domain_id, xml), xml)
-        elif known[1] != xml:
+        elif joined[1] != xml:
             raise TransportError(f"DDS domain {domain_id} is already configured otherwise in this process")
 
 

@@ -167,10 +167,10 @@ def is_described(endpoint: Any, type_name: str) -> bool:
 
 
 class _Endpoint:
-    def __init__(self, entity: Any, handles: Callable[[], list[int]], known: Callable[[int], Any]) -> None:
+    def __init__(self, entity: Any, handles: Callable[[], list[int]], read_peer: Callable[[int], Any]) -> None:
         self.entity = entity
         self._reference = entity._ref  # noqa: SLF001 - the handle ctypes needs
-        self._handles, self._known = handles, known
+        self._handles, self._read_peer = handles, read_peer
 
     def peers(self) -> list[int]:
         """Return the handles of matched peers; cyclonedds counts first, and fails where one more has come since."""
@@ -185,7 +185,7 @@ class _Endpoint:
         """Return what is known of one matched peer, a DcpsEndpoint; None if it has left, even while this was read."""
         try:
             with _reading:
-                return self._known(handle)
+                return self._read_peer(handle)
         except Exception as error:
             if str(error).startswith("Callfunc"):  # a bare Exception, of cyclonedds' C extension
                 return None
@@ -256,16 +256,16 @@ def writers_of(participant: DomainParticipant) -> Callable[[], list[Any]]:
     Nor does it of a writer's QoS that was read: each change is taken once.
     """
     reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-    known: dict[UUID, Any] = {}
+    writers: dict[UUID, Any] = {}
 
     def read() -> list[Any]:
         with _reading:
             while changes := reader.take(WRITERS_AT_MOST):
                 for writer in changes:
-                    known.pop(writer.key, None)
+                    writers.pop(writer.key, None)
                     if writer.sample_info.instance_state & InstanceState.Alive:
-                        known[writer.key] = writer
-            return list(known.values())
+                        writers[writer.key] = writer
+            return list(writers.values())
 
     return read
 

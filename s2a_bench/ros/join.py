@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 from pydantic import Field
 
 from s2a_bench.errors import UsageError
-from s2a_bench.ros import MIDDLEWARES, Middleware, chosen, open_middleware
+from s2a_bench.ros import MIDDLEWARES, Middleware, middleware_kind, open_middleware
 from s2a_bench.text import none_of
 
 T = TypeVar("T")
@@ -46,7 +46,7 @@ class RosParameters(PlaceParameters):
 
     def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
         """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""
-        place = chosen(self.middleware).place_in(self)
+        place = middleware_kind(self.middleware).place_in(self)
         node = open_middleware(self.middleware, domain_id=self.domain_id, node_name=name, place=place)
         try:
             return opened(node)

@@ -154,9 +154,9 @@ def _types(version: str) -> tuple[Typestore, Defaults]:
     folders |= {"s2a_msgs": root / "s2a_msgs", "llama_msgs": root / "interfaces" / VERSIONS[version]}
     defaults: Defaults = {}
     for package, folder in folders.items():
-        definitions, given = read_package(folder, package)
+        definitions, package_defaults = read_package(folder, package)
         store.register(definitions)
-        defaults |= given
+        defaults |= package_defaults
     return store, defaults
 
 
@@ -173,13 +173,13 @@ def message(type_name: str, /, **fields: Any) -> Any:
 def default(type_name: str, version: str = DEFAULT_VERSION, /, **fields: Any) -> Any:
     """Build a message as ROS initialises it, the defaults of its interface file or zeros; ``fields`` replace them."""
     store, defaults = _types(version)
-    given = defaults.get(type_name, {}) | fields
+    values = defaults.get(type_name, {}) | fields
     for name, description in store.fielddefs[type_name][1]:
-        if name not in given:
-            given[name] = _zero(description, version)
-        elif isinstance(given[name], Iterable) and not isinstance(given[name], str):
-            given[name] = _sequence(description, given[name])
-    return store.types[type_name](**given)
+        if name not in values:
+            values[name] = _zero(description, version)
+        elif isinstance(values[name], Iterable) and not isinstance(values[name], str):
+            values[name] = _sequence(description, values[name])
+    return store.types[type_name](**values)
 
 
 def _zero(description: Any, version: str) -> Any:

@@ -184,8 +184,8 @@ class Parameters:
         if not declared.live:
             raise UsageError(f"parameter {declared.name} is read-only: start the node with another value")
         value = value_of(parameter.value)
-        if (given := Type(parameter.value.type)) != (wanted := type_of(declared.value)):
-            raise UsageError(f"parameter {declared.name} is of type {wanted.name}, not {given.name}")
+        if (sent := Type(parameter.value.type)) != (wanted := type_of(declared.value)):
+            raise UsageError(f"parameter {declared.name} is of type {wanted.name}, not {sent.name}")
         return value
 
 

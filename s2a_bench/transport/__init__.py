@@ -373,12 +373,12 @@ def paths() -> Iterator[str]:
 def named_by(url: str) -> str:
     """Return the transport of a URL's scheme, ``http`` without one; raises UsageError for an unknown scheme."""
     scheme, mark, _ = url.partition("://")
-    known = {scheme: name for name, each in TRANSPORTS.loaded() for scheme in each.urls.schemes}
-    if mark and scheme.lower() not in known:
+    by_scheme = {scheme: name for name, each in TRANSPORTS.loaded() for scheme in each.urls.schemes}
+    if mark and scheme.lower() not in by_scheme:
         raise UsageError(
-            f"`url`: no installed transport speaks {scheme}://, only {', '.join(f'{each}://' for each in known)}"
+            f"`url`: no installed transport speaks {scheme}://, only {', '.join(f'{each}://' for each in by_scheme)}"
         )
-    return known.get(scheme.lower(), "http")
+    return by_scheme.get(scheme.lower(), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:

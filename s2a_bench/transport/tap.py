@@ -64,13 +64,13 @@ class TapReader:
     `begin_answer` and `end_answer`. What a server sends while no request waits, such as a greeting, is no answer.
     """
 
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        """Call ``report`` with each exchange; ``known`` are the kinds whose requests need not be decoded any more."""
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        """Call ``report`` with each exchange; ``kinds`` are the kinds whose requests need not be decoded any more."""
         self.report = report
         self.pings = 0
         self.from_ns = self.to_ns = 0
         """When the bytes that are read arrived, and when they had been passed on."""
-        self._known = known
+        self._kinds = kinds
         self._waiting = deque[Seen]()
 
     def passed(self, data: bytes, from_ns: int, to_ns: int, *, up: bool) -> None:
@@ -86,10 +86,10 @@ class TapReader:
 
     def fresh(self, seen: Seen) -> bool:
         """Whether a request is the first of its kind, whose content is wanted; beyond `MOST_KINDS` all are one kind."""
-        if seen.what not in self._known and len(self._known) >= MOST_KINDS:
+        if seen.what not in self._kinds and len(self._kinds) >= MOST_KINDS:
             seen.what = OTHERS
-        fresh = seen.what not in self._known
-        self._known.add(seen.what)
+        fresh = seen.what not in self._kinds
+        self._kinds.add(seen.what)
         return fresh
 
     def begin_request(self, what: str = "") -> Seen:
@@ -213,8 +213,8 @@ class Incoming:
 class ParsedTapReader(TapReader):
     """A reader whose directions are parsed by a generator each, `messages`."""
 
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(report, known)
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        super().__init__(report, kinds)
         self._up = Incoming(lambda incoming: self.messages(incoming, up=True))
         self._down = Incoming(lambda incoming: self.messages(incoming, up=False))
 

@@ -387,7 +387,7 @@ def test_lambda_is_followed_live_by_each_policy(
 ) -> None:
     policies = ("stream-to-act", "stream-to-act?detect=True", "naive")
     live(requesting(config, requests=2).but(policies=policies, track=True, n_skills=(3,)), tmp_path)
-    assert [each.made.detect for each in taught] == [False, True] * 2
+    assert [each.base.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
     for each in taught[:2]:
         assert each.tracker.level != each.tracker.epsilon == 0.01

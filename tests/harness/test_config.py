@@ -30,13 +30,13 @@ def names(config: RequestsConfig) -> list[str]:
 @pytest.fixture(autouse=True)
 def no_llama_server(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether llama.cpp's own server is on this machine decides nothing here; where it matters, a test says so."""
-    monkeypatch.setattr(http, "found_llama_server", lambda: None)
+    monkeypatch.setattr(http, "installed_llama_server", lambda: None)
 
 
 @pytest.fixture
 def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have llama.cpp's own server on this machine, and nothing that our own could run a model with."""
-    monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
+    monkeypatch.setattr(http, "installed_llama_server", lambda: http.WHEEL)
     monkeypatch.setattr(extras, "installed", lambda module: module != "llama_cpp")
 
 
@@ -55,7 +55,7 @@ def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
     options: dict[str, Any], there: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
+    monkeypatch.setattr(http, "installed_llama_server", lambda: http.WHEEL)
     config = RequestsConfig(**options)
     assert ("http/llama-server" in names(config)) is there
     for cell in config.pipelines:

@@ -73,7 +73,8 @@ def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
         follower_law=scenario.follower_law,
         seeds={"sampling": config.seed, "nonce": requests.feed.nonce},
     )
-    shape, learning = PlanShape(scenario.skills, tokens, scenario.durations), LearningPlan(config.chosen, config.seed)
+    shape = PlanShape(scenario.skills, tokens, scenario.durations)
+    learning = LearningPlan(config.named_policies, config.seed)
     return CcrbLivePlan(scenario, requests, prompt, shape, learning)
 
 

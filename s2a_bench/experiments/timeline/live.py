@@ -52,17 +52,17 @@ def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
         configuration={**requests.manifest["configuration"], **config.to_manifest(), **engine},
         seeds={"sampling": config.seed, "source": config.seed, "nonce": requests.feed.nonce},
     )
-    learning = LearningPlan(config.chosen, config.seed, config.epsilon, config.track)
+    learning = LearningPlan(config.named_policies, config.seed, config.epsilon, config.track)
     return LivePlan(requests, prompts, learning, config.robot, config.skill_set)
 
 
 def prompt_plan(config: TimelineLive) -> PromptPlan:
     skills = config.skill_set
-    given = [
+    prompts = [
         replace(skills, skills=tuple(replace(each, durations=config.lasting(t_nom_s)) for each in skills.skills))
         for t_nom_s in config.t_nom_s
     ]
-    return PromptPlan(given or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
+    return PromptPlan(prompts or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
 
 
 def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:

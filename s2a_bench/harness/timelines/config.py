@@ -29,7 +29,7 @@ class PolicyOptions(Options):
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
     @cached_property
-    def chosen(self) -> dict[str, Policy]:
+    def named_policies(self) -> dict[str, Policy]:
         return policies(self.policies)
 
 
@@ -77,7 +77,7 @@ class PlanRequests(FirstVariants):
             )
 
 
-def check_steppers(chosen: Iterable[Policy]) -> None:
+def check_steppers(policies: Iterable[Policy]) -> None:
     """Raise UsageError for a policy that cannot follow a plan as it arrives."""
-    for policy in chosen:
+    for policy in policies:
         policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))

@@ -51,7 +51,7 @@ def warm_up(
 
 
 def act(
-    chosen: Mode,
+    mode: Mode,
     setting: ControlSetting,
     sessions: Sequence[Session],
     launch: RunningLaunch,
@@ -75,9 +75,9 @@ def act(
         if isinstance(robot, TaskRobot) and robot.over and not warmup:
             acting.finish()
 
-    acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
+    acting = RobotTicks(mode, setting, send, request_chunk, ticks)
     seed = launch.plan.blocks.seed
-    requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
+    requester = ChunkRequester(sessions, setting.horizon, seed, mode.streams, acting.arrived, blocks, warmup)
     loop = ControlLoop([acting])
     with requester.running():
         try:

@@ -57,11 +57,11 @@ class OpenVla(Dialect):
         extras.require("json_numpy", "act")
         if not options.template:
             return
-        self._template = made = template_of(options.template)
-        made.check_server(self.name, ("path", "answer", "arrays_as_text", "arrays_as_lists"))
-        self.path = made.server.path or self.path
-        self.answer_kinds, self.accepts_state = (ACTIONS,), made.accepts_state
-        self.payloads = PolicyTransport.payloads[1:] if made.encoded else self.payloads
+        self._template = template = template_of(options.template)
+        template.check_server(self.name, ("path", "answer", "arrays_as_text", "arrays_as_lists"))
+        self.path = template.server.path or self.path
+        self.answer_kinds, self.accepts_state = (ACTIONS,), template.accepts_state
+        self.payloads = PolicyTransport.payloads[1:] if template.encoded else self.payloads
 
     def check(self, cameras: int, state: int) -> None:
         if self._template is not None:

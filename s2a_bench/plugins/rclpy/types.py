@@ -36,21 +36,21 @@ def interface_class(type_name: str) -> Any:
 
 def to_ros(message: Any, cls: Any, type_name: str, version: str) -> Any:
     with _without_pixels(message, np.empty(0, np.uint8)) as pixels:
-        made = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
-    for image, its in zip(images_of(made), pixels, strict=True):
+        converted = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
+    for image, its in zip(images_of(converted), pixels, strict=True):
         data = array("B")
         data.frombytes(np.ascontiguousarray(its).data.cast("B"))
         image.data = data
-    return made
+    return converted
 
 
 def from_ros(message: Any, type_name: str, version: str) -> Any:
     """Turn a message of a generated class into a rosbags message, whose arrays are views of its CDR or pixels."""
     with _without_pixels(message, array("B")) as pixels:
-        made = ros.deserialise(memoryview(serialize_message(message)), type_name, version)
-    for image, its in zip(images_of(made), pixels, strict=True):
+        converted = ros.deserialise(memoryview(serialize_message(message)), type_name, version)
+    for image, its in zip(images_of(converted), pixels, strict=True):
         image.data = np.frombuffer(its, np.uint8)
-    return made
+    return converted
 
 
 @contextmanager

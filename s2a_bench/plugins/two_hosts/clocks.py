@@ -239,12 +239,12 @@ class Asked:
     command: tuple[str, ...]
     error_s: Callable[[str], float]
     """Reads the error off its output."""
-    known: WallClock | None = None
+    last: WallClock | None = None
 
     def __call__(self) -> WallClock:
         """Read the wall clock, and ask for its error; raises RequestFailed if that is not told."""
-        if self.known and now_ns() - self.known.read_ns < FRESH_NS:
-            return self.known
+        if self.last and now_ns() - self.last.read_ns < FRESH_NS:
+            return self.last
         try:
             done = subprocess.run(  # noqa: S603 - one of two fixed commands
                 self.command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
@@ -256,8 +256,8 @@ class Asked:
             ) from error
         began_ns, offset_ns = now_ns(), realtime_offset_ns()
         ended_ns = now_ns()
-        self.known = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
-        return self.known
+        self.last = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
+        return self.last
 
 
 def chrony_error_s(csv: str) -> float:

@@ -170,10 +170,10 @@ def load_link(text: str) -> LinkProfile:
         values = {"trace": first}
     elif "/" in first or first.endswith(".toml"):
         values = {"name": Path(first).stem, **loads(read(first, "link"), f"link {first}")}
-    elif first in (known := published()):
-        values = known[first].model_dump(exclude_unset=True)
+    elif first in (profiles := published()):
+        values = profiles[first].model_dump(exclude_unset=True)
     else:
-        raise UsageError(f"`link`: {none_of(first, known, ', and no file (.toml, .csv) and no KEY=VALUE')}")
+        raise UsageError(f"`link`: {none_of(first, profiles, ', and no file (.toml, .csv) and no KEY=VALUE')}")
     for pair in pairs:
         values |= _pair(pair)
     named = {"name": text} | values

@@ -63,7 +63,7 @@ class ByteRelay:
         self._lock = Lock()
         self._clients: list[TappedClient] = []
         self._joined: dict[socket.socket, Thread] = {}
-        self._known: set[str] = set()
+        self._kinds: set[str] = set()
         self._lines: set[str] = set()
         self._connections = Connections(self.listener, self._handle, LIMITS.connections, b"")
 
@@ -112,7 +112,7 @@ class ByteRelay:
     def _join(self, client: TappedClient, robot: socket.socket, server: socket.socket) -> None:
         for each in (robot, server):
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        passed = Passed(self.reader(lambda seen: self.report(client.number, seen), self._known), self._failed)
+        passed = Passed(self.reader(lambda seen: self.report(client.number, seen), self._kinds), self._failed)
         down = Thread(target=_pass, args=(server, robot, passed), kwargs={"up": False}, name="down", daemon=True)
         down.start()
         _pass(robot, server, passed, up=True)

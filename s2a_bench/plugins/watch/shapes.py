@@ -28,11 +28,11 @@ NUMBER, TEXT, BYTE = "number", "text", "byte"
 
 def described(request: Any) -> str:
     """Describe a request: "3 pictures 224x224 float32, 8 numbers, 1 text; as JPEG about 60 kB"."""
-    found, jpeg = Counter[str](), 0
+    counts, jpeg = Counter[str](), 0
     for kind, count, size in islice(_values(request), MOST):
-        found[kind] += count
+        counts[kind] += count
         jpeg += size
-    words = ", ".join(f"{count} {_plural(kind) if count > 1 else kind}" for kind, count in found.items())
+    words = ", ".join(f"{count} {_plural(kind) if count > 1 else kind}" for kind, count in counts.items())
     return words + (f"; as JPEG about {max(1, round(jpeg / 1e3))} kB" if jpeg else "")
 
 

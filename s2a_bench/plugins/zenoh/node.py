@@ -112,7 +112,7 @@ class Node:
         self.session, self.domain_id, self._name = session, domain_id, name
         self._id = str(session.zid())
         self._numbers = count(1)
-        self._known: dict[tuple[str, str], dict[str, names.Entity]] = {}
+        self._entities: dict[tuple[str, str], dict[str, names.Entity]] = {}
         """(kind, name) -> token -> what it tells."""
         self._lock = Lock()
         with refusals("node"):
@@ -136,14 +136,14 @@ class Node:
     def peers(self, kind: str, entity: names.Entity) -> Iterator[str]:
         """Yield the type hashes of the endpoints of a kind that have the name and type of ``entity``."""
         with self._lock:
-            known = [*self._known.get((kind, entity.name), {}).values()]
-        return (each.type_hash for each in known if each.type_name == entity.type_name)
+            entities = [*self._entities.get((kind, entity.name), {}).values()]
+        return (each.type_hash for each in entities if each.type_name == entity.type_name)
 
     def sessions(self, kind: str, entity: names.Entity, gid: bytes = b"") -> set[str]:
         """Return the sessions of the endpoints of a kind that match ``entity``, or of the one with a ``gid``."""
         with self._lock:
-            known = [*self._known.get((kind, entity.name), {}).items()]
-        matching = (token for token, each in known if each.type_hash == entity.type_hash)
+            entities = [*self._entities.get((kind, entity.name), {}).items()]
+        matching = (token for token, each in entities if each.type_hash == entity.type_hash)
         return {names.session_of(token) for token in matching if not gid or names.gid_of(token) == gid}
 
     def offers(self) -> list[Offer]:
@@ -152,8 +152,8 @@ class Node:
             return Offer(each.name.replace("%", "/"), ros_type_name(each.type_name), reliable)
 
         with self._lock:
-            known = [of_name for (kind, _), of_name in self._known.items() if kind == names.PUBLISHER]
-            return [offer(*item) for of_name in known for item in of_name.items()]
+            publishers = [of_name for (kind, _), of_name in self._entities.items() if kind == names.PUBLISHER]
+            return [offer(*item) for of_name in publishers for item in of_name.items()]
 
     def matching(self, kind: str, entity: names.Entity) -> int:
         """Count the endpoints of a kind to which ``entity`` speaks, or which speak to it."""
@@ -167,13 +167,13 @@ class Node:
             return
         at = (entity.kind, entity.name)
         with self._lock:
-            of_name = self._known.setdefault(at, {})
+            of_name = self._entities.setdefault(at, {})
             if sample.kind == zenoh.SampleKind.PUT:
                 of_name[token] = entity
             else:
                 of_name.pop(token, None)
             if not of_name:
-                del self._known[at]
+                del self._entities[at]
 
 
 @contextmanager

@@ -66,7 +66,7 @@ class Head:
 
     def value(self, name: str) -> str:
         """Return the value of a header; several are joined to a list (RFC 9110, 5.3)."""
-        return ", ".join(value for known, value in self.headers if known == name)
+        return ", ".join(value for header, value in self.headers if header == name)
 
     def body_bytes(self, most: int) -> int:
         """Return the length of the body; raises Refused if it is not given, or too large."""

@@ -197,8 +197,8 @@ class ServerSide(HttpSide):
 
 
 class HttpReader(TapReader):
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(report, known)
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        super().__init__(report, kinds)
         self._requests = ClientSide(self, httptools.HttpRequestParser)
         self._answers = ServerSide(self, httptools.HttpResponseParser)
 

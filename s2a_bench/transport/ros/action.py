@@ -65,11 +65,11 @@ class GenerateClient(RosClient):
         self._name = action or namespace + ACTION
         self._absent = f"no action server appeared at {self._name}"
         self._version = ros.DEFAULT_VERSION  # until a server's type hash shows another
-        self._client = self._found_client()
+        self._client = self._open_client()
         if (spoken := self._client.server_version() or self._version) != self._version:
             self.middleware.close()  # a client of the other version would go on collecting messages that are never read
             self.middleware, self._version = join(self._wiring, "client"), spoken
-            self._client = self._found_client()
+            self._client = self._open_client()
         self._marks = None
         self._origin = self.middleware.subscription(
             self._name.rpartition("/")[0] + wire.PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
@@ -78,7 +78,7 @@ class GenerateClient(RosClient):
             self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
             self.wait_until(lambda: bool(self._marks and self._marks.matched()), self._absent)
 
-    def _found_client(self) -> ActionClient:
+    def _open_client(self) -> ActionClient:
         """Wait for the server; raises TransportError for one that is there and cannot be spoken to."""
         client = self.middleware.action_client(self._name, llama.GENERATE_RESPONSE, self._version)
         try:

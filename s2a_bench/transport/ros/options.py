@@ -9,7 +9,7 @@ from pydantic import create_model, field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
-from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, chosen
+from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, middleware_kind
 from s2a_bench.ros.join import PLACES
 from s2a_bench.ros.remap import ABSOLUTE, RULE
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
@@ -138,4 +138,4 @@ class RosOptions(PlaceOptions):
 
     @property
     def kind(self) -> MiddlewareKind:
-        return chosen(self.middleware)
+        return middleware_kind(self.middleware)

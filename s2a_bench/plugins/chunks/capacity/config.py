@@ -223,10 +223,10 @@ class CapacityOptions(ControlOptions):
             raise UsageError(f"`episodes`: {self.episodes_s:g} s need a control clock, and two of its ticks")
         if self.episodes_s and self.settle_ns >= self.episodes_s * 1e9:
             raise UsageError(f"`settle`: {self.settle_s:g} s leave nothing of an episode of {self.episodes_s:g} s")
-        limit, given = self.search.limit, self.model_fields_set
-        if "think_s" in given and not self.closed_loop:
+        limit, fields = self.search.limit, self.model_fields_set
+        if "think_s" in fields and not self.closed_loop:
             raise UsageError("`think` needs `closed_loop`")
-        if "modes" in given and self.load != "chunks":
+        if "modes" in fields and self.load != "chunks":
             raise UsageError("`modes` are ways to act on chunks of actions; leave them out without chunks")
         least_s = FEWEST_PLANS * self.plan_ns / 1e9
         acts_s = self.episodes_s - self.settle_ns / 1e9 if self.episodes_s else self.seconds

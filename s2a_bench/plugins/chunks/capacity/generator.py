@@ -321,7 +321,7 @@ class RemoteFleet:
         """Return a method of that fleet; it raises what that raises, ServerDied if the process has ended."""
         return partial(self._call, name)
 
-    def _call(self, name: str, *given: Any) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         raise NotImplementedError
 
 
@@ -342,9 +342,9 @@ class FleetProcess(RemoteFleet):
         self._process.kill()
         self._pipe.close()
 
-    def _call(self, name: str, *given: Any) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         try:
-            self._pipe.send((name, given))
+            self._pipe.send((name, arguments))
             reply = self._pipe.recv()
         except (EOFError, OSError) as error:
             raise ServerDied(f"a process of robots (pid {self._process.pid}) died; take fewer robots") from error
@@ -360,9 +360,9 @@ def _serve(plan: FleetPlan, pipe: Connection) -> None:
     fleet, name = Fleet(plan), ""
     with suppress(EOFError, OSError):
         while name != "close":
-            name, given = pipe.recv()
+            name, arguments = pipe.recv()
             try:
-                reply = getattr(fleet, name)(*given)
+                reply = getattr(fleet, name)(*arguments)
             except Exception as error:  # noqa: BLE001 - raised again by the caller
                 reply = error
             pipe.send(reply)
@@ -387,8 +387,8 @@ class FleetOnRay(RemoteFleet):
         self._ray.wait([self._fleet.close.remote()], timeout=2 * PATIENCE_S)
         self._ray.kill(self._fleet)
 
-    def _call(self, name: str, *given: Any) -> Any:
-        return self._result(getattr(self._fleet, name).remote(*given))
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return self._result(getattr(self._fleet, name).remote(*arguments))
 
     def _result(self, reference: Any) -> Any:
         errors = self._ray.exceptions

@@ -196,8 +196,8 @@ class _Cell:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
         tried, name, limit = self.tried.values(), self.load.of(self.session.cell.name), self.search.limit
         driven = max((each.robots for each in tried if each.clean), default=0)
-        if limit is not None and (found := knee(tried)) is not None:
-            row = KneeRow(name, "measured", self.load.limit_text(limit), found.robots, found.low, found.high, driven)
+        if limit is not None and (point := knee(tried)) is not None:
+            row = KneeRow(name, "measured", self.load.limit_text(limit), point.robots, point.low, point.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
             what = f"{name}: {', '.join(map(str, late))} robots are no measurement: the generator was late or too slow"

@@ -131,8 +131,8 @@ def _storage(data: bytes) -> Numbers:
     file = BytesIO(data)
     *head, system, storage, _ = (_load(file, STORAGES) for _ in range(5))
     kind, dtype, _, _, count, view = storage
-    known = kind == "storage" and dtype in STORAGES.values() and view is None
-    if tuple(head) != HEAD or not system["little_endian"] or not known:
+    is_storage = kind == "storage" and dtype in STORAGES.values() and view is None
+    if tuple(head) != HEAD or not system["little_endian"] or not is_storage:
         raise ValueError("a storage that is not torch's, is big-endian, or of no type of an action")
     count_field, numbers = file.read(COUNT.itemsize), np.frombuffer(file.read(), dtype)
     if count_field != count.to_bytes(COUNT.itemsize, "little") or len(numbers) != count:

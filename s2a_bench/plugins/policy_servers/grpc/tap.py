@@ -72,8 +72,8 @@ class SeenCall:
 
 
 class GrpcReader(ParsedTapReader):
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(report, known)
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        super().__init__(report, kinds)
         self._calls: dict[int, SeenCall] = {}
         self._observations = deque[SeenCall](maxlen=OBSERVATIONS)
 

@@ -118,9 +118,9 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
     def _exchanged(self, link: Link, body: bytes, cameras: int) -> bytes:
         for index, path in self._ignored:
             if index < cameras:
-                known, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
+                keys, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
                 name = self._template.name
-                raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
+                raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {keys}; {cure}")
         link.send(body)
         return self._message(link)
 

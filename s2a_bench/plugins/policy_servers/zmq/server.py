@@ -149,8 +149,8 @@ class ZmqServer:
         """Raise RequestFailed for a message that is none, or has not the key, compared in constant time."""
         if not isinstance(message, dict):
             raise RequestFailed(f"a request is a map, not {type(message).__name__}")
-        given = message.get(layouts.TOKEN)
-        token = given.encode(errors="replace") if isinstance(given, str) else b""
+        value = message.get(layouts.TOKEN)
+        token = value.encode(errors="replace") if isinstance(value, str) else b""
         if self._key and not hmac.compare_digest(token, self._key):
             raise RequestFailed(f"Unauthorized: this server wants its key as {layouts.TOKEN}")
 
@@ -165,8 +165,8 @@ class ZmqServer:
             return {}
         if endpoint == layouts.KILL:
             raise RequestFailed("this server is not ended over the network: stop its process")
-        known = f"{layouts.GET_ACTION}, {layouts.PING}, {layouts.RESET}, {layouts.MODALITIES}"
-        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is not one of {known}")
+        endpoints = f"{layouts.GET_ACTION}, {layouts.PING}, {layouts.RESET}, {layouts.MODALITIES}"
+        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is not one of {endpoints}")
 
     def _reply(self, envelope: list[bytes], message: bytes | memoryview) -> None:
         """Have the thread that has the ROUTER send a message."""

@@ -161,11 +161,11 @@ class _Probe:
 
 
 def _socket(address: str, stack: ExitStack) -> socket.socket:
-    made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    made.bind((address, 0))
+    receiver = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    receiver.bind((address, 0))
     with suppress(PermissionError):  # the usual buffer holds some 180 packets
-        made.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
-    return made
+        receiver.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
+    return receiver
 
 
 def _receive(receiver: socket.socket, data: bytes) -> None:
