@@ -60,7 +60,7 @@ def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
     """Return the text of a file that an ``option`` names; raises UsageError."""
     try:
         return read_text(path, most)
-    except (OSError, ValueError) as error:  # it is no UTF-8, or its name has a NUL
+    except (OSError, ValueError) as error:  # it is not UTF-8, or its name has a NUL
         raise UsageError(f"`{option}`: cannot read {path}: {error}") from error
 
 

@@ -96,7 +96,7 @@ class Remote:
 
     @staticmethod
     def of_json(value: Mapping[str, Any]) -> Remote:
-        """Read a server's JSON; raises ValueError, KeyError or TypeError if it is no report."""
+        """Read a server's JSON; raises ValueError, KeyError or TypeError if it is malformed."""
         return Remote(
             clock=value["clock"],
             marks=[(stage, stamp) for stage, stamp in value["marks"]],

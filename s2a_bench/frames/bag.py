@@ -65,7 +65,7 @@ class Recording(ImageMessages):
 
 
 def open_recording(path: str, option: str = "source") -> Any:
-    """Return an open reader of rosbags; raises SourceError, naming the option, for what is no recording."""
+    """Return an open reader of rosbags; raises SourceError, naming the option, for anything but a recording."""
     if not Path(path).exists():
         raise SourceError(f"`{option}`: no recording at {path}")
     try:

@@ -101,7 +101,7 @@ def encode_png(bgr: Pixels) -> Pixels:
 
 
 def decode_image(data: BytesLike) -> Pixels:
-    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError if it is none, or is too large.
+    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError for another file, or a too large one.
 
     A truncated JPEG is an error in OpenCV 5; OpenCV 4 fills in the missing part.
     """

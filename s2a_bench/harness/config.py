@@ -43,7 +43,7 @@ DEFAULT_TASK = "pick up the red block and place it in the box"
 
 if TYPE_CHECKING:
     TransportOptions: TypeAlias = Options
-else:  # a group of options for each transport; options that only `serve` has are no flags
+else:  # a group of options for each transport; options that only `serve` has get no flag
     TransportOptions = create_model(
         "PerTransport",
         __base__=Options,

@@ -1,4 +1,4 @@
-"""The plan of a run of requests: all that follows from its configuration, decided once."""
+"""The run plan of requests: all that follows from a configuration, decided once."""
 
 from __future__ import annotations
 
@@ -69,6 +69,7 @@ class RequestPlan:
     state: int
     """Length of the robot's state."""
     mode: str
+    """The request mode: request or stream."""
     size: str
     stages: Mapping[str, str]
     """Stage -> group of all transports, in the order of the path."""
@@ -98,7 +99,7 @@ class RunPlan:
     checks: Mapping[str, str]
     """Code -> the doctor's checks that concern the transports."""
     manifest: Mapping[str, Any]
-    """The manifest's entries about the plan."""
+    """The manifest's entries about the run plan."""
 
     def with_manifest(self, **facts: Any) -> RunPlan:
         return replace(self, manifest={**self.manifest, **facts})

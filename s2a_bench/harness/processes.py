@@ -253,6 +253,7 @@ class LlamaServerProcess(ServerProcess):
             if not self.alive():
                 raise self.no_start()
             try:
+                # alive: the port was free only until `_free_port` closed it, so another server may answer
                 ready = httpx.get(self.address + "/health", trust_env=False).is_success and self.alive()
             except httpx.TransportError:
                 ready = False  # it does not listen yet

@@ -114,7 +114,7 @@ class Task:
     tables: Sequence[Table[Any]] = ()
     """Tables whose files exist from the start, besides those of requests."""
     source: Callable[[FeedPlan], FrameSource] | None = None
-    """Opens the one camera, whose pictures are stamped already; None: the plan's source, stamped for each cell."""
+    """Opens the one camera, whose pictures are stamped already; None: the run plan's source, stamped for each cell."""
 
 
 def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) -> Path:

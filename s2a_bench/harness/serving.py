@@ -50,6 +50,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
                 if not trace.token_ns:
                     if preprocess_ms := engine.facts.get(PREPROCESS_MS):
                         handed_ns = trace.marks[-1][1]
+                        # at most now: marks are in order of time, whatever the engine reports
                         trace.marks.append(("preprocess", min(handed_ns + round(preprocess_ms * 1e6), now)))
                     trace.marks.append(("inference", now))
                 trace.token_ns.append(now)

@@ -168,6 +168,7 @@ class Session:
             error, fatal = INTERRUPTED, interrupt
         self.sampler.edge()
         self._pictures = len(frames)
+        # of the whole answer: a secret may span pieces
         texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [(replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at) for piece, at in seen]
         trace.facts.update(self.sampler.window(started_ns, now_ns()))

@@ -35,7 +35,7 @@ PILE_MS, PILED = 0.5, 0.1
 
 
 def before_run(checks: Mapping[str, str] | None = None, machine: Machine | None = None) -> list[RunWarning]:
-    """Return the doctor's warnings that concern any run, and those of a plan's ``checks``."""
+    """Return the doctor's warnings that concern any run, and those of a run plan's ``checks``."""
     return warnings_of(examine(machine or Machine(), {code: CHECKS[code] for code in BEFORE_RUN} | dict(checks or {})))
 
 

@@ -357,7 +357,7 @@ def swing(horizon: int, dims: int, seed: int) -> NDArray[np.float32]:
 
     ticks, joints = np.arange(horizon)[:, None], np.arange(dims)[None, :]
     values = np.sin(tau * (ticks + seed) / PERIOD + joints).astype(np.float32)
-    values.flags.writeable = False
+    values.flags.writeable = False  # cached: requests share it
     return values
 
 

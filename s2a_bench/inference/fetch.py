@@ -60,7 +60,7 @@ def fetch(config: FetchConfig) -> Fetched:
     for name in reversed(names):  # a language model that is there without its mmproj would pass for a text model
         path = Path(_call(api.hf_hub_download, repository, filename=name, revision=info.sha))
         if (digest := sha256(path)) != lfs[name].sha256:
-            for each in {path, path.resolve()}:
+            for each in {path, path.resolve()}:  # the cache's link, and the file that it leads to
                 each.unlink()
             raise ModelError(
                 f"{name}: has SHA-256 {digest}, the hub says {lfs[name].sha256}; it was deleted, fetch again"

@@ -85,7 +85,7 @@ def read_header(path: Path, flag: str) -> GgufHeader:
     Raises ModelError, which names ``flag``, if the file is missing, no GGUF, damaged or truncated.
     """
     try:
-        if path.is_fifo() or path.is_char_device():
+        if path.is_fifo() or path.is_char_device():  # opening a pipe would wait for its writer
             raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
         with path.open("rb") as file:
             if not os.fstat(file.fileno()).st_size:

@@ -187,7 +187,7 @@ class LlamaCppEngine(Engine):
             for index in range(request.max_tokens):
                 started_ns = now_ns()
                 token = next(ids)
-                if index == 1:
+                if index == 1:  # the first token is sampled from the prompt's logits, without a decode
                     self._facts[FIRST_DECODE_MS] = (now_ns() - started_ns) / _MS_NS
                 if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
                     return

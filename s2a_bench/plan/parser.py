@@ -42,7 +42,7 @@ class SkillParsed:
 
 @dataclass(frozen=True, slots=True)
 class BadLine:
-    """A line that is no skill. ``text`` is cut if the line is too long."""
+    """A line that is not a skill. ``text`` is cut if the line is too long."""
 
     problem: Problem
     text: str

@@ -100,7 +100,7 @@ class Calibration:
 
 
 def promise(calibrations: Mapping[str, Mapping[str, Any]], what: str, unit: str) -> str:
-    """Return the share of further ``unit`` (plural) that ``what`` lets stall, the greatest of named calibrations.
+    """Return the share of future ``unit`` (plural) that may stall under ``what``, by the weakest calibration.
 
     Calibrations are plain data; one whose scores are not exchangeable promises nothing, and the sentence says so.
     """

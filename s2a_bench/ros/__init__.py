@@ -124,7 +124,7 @@ class ActionClient(Protocol):
         """Return whether a whole server is matched now."""
 
     def other_dds(self) -> str:
-        """Return the DDS of a server that is there and cannot be spoken to, "" if there is none."""
+        """Return the DDS of a server that is present but incompatible, else ""."""
 
     def server_version(self) -> str | None:
         """Return the interface version whose type hash the server announces; None if it announces none.

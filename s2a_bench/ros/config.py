@@ -40,7 +40,7 @@ multicast alone, as Fast DDS does on a subnet, and starts later than that would 
 
 
 def domain_id(environ: Mapping[str, str], option: int | None = None) -> int:
-    """Return the chosen DDS domain, else that of ROS_DOMAIN_ID, else 0; raises UsageError for what is no domain."""
+    """Return the DDS domain of the option, else of ROS_DOMAIN_ID, else 0; raises UsageError for an invalid one."""
     if option is not None:
         return option
     text = environ.get("ROS_DOMAIN_ID") or "0"
@@ -58,7 +58,7 @@ def discovery_range(environ: Mapping[str, str], default: str) -> str:
 
 
 def static_peers(environ: Mapping[str, str]) -> list[str]:
-    """Return the addresses of ROS_STATIC_PEERS; raises UsageError for what is none."""
+    """Return the addresses of ROS_STATIC_PEERS; raises UsageError for an invalid one."""
     peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not PEER.fullmatch(peer):
@@ -84,5 +84,6 @@ def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
         f'<CycloneDDS><Domain id="any"><General>{general}</General>'
         f"{TUNED_INTERNAL if tuning == 'tuned' else ''}"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+        # with a longer interval a ROS process in SUBNET mode that starts after us is not met for 40 s
         f"<SPDPInterval>1s</SPDPInterval>{PATIENT}<Peers>{listed}</Peers></Discovery></Domain></CycloneDDS>"
     )

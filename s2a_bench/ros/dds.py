@@ -134,7 +134,7 @@ def dds_qos(qos: QoS, announced: str) -> Qos:
         *lasting,
         *mortal,
         Policy.WriterDataLifecycle(autodispose=False),
-        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.DataRepresentation(use_cdrv0_representation=True),  # ROS endpoints accept XCDR1 alone
         Policy.Userdata(announced.encode()),
     )
 

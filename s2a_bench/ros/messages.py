@@ -232,7 +232,7 @@ def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION, *, pad
     size = serialised_bytes(value, type_name, version)
     padding = -size % 4 if padded else 0
     buffer = bytearray(size + padding)
-    buffer[1], buffer[3] = 1, padding
+    buffer[1], buffer[3] = 1, padding  # ROS ignores the count of padding; Cyclone writes it
     store.get_msgdef(type_name).serialize_cdr_le(memoryview(buffer)[CDR_HEADER:], 0, value, store)
     return buffer
 

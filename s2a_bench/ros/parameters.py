@@ -96,7 +96,7 @@ def value_message(value: Any) -> Any:
 
 
 def value_of(message: Any) -> Any:
-    """Read a ParameterValue; raises UsageError for a type that is none."""
+    """Read a ParameterValue; raises UsageError for an unknown type."""
     try:
         kind = Type(message.type)
     except ValueError:

@@ -122,7 +122,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         except OSError as error:
             raise self._failed(error) from error
         finally:
-            self._writer.abort()  # lets go of the file where closing did not get that far
+            self._writer.abort()  # closes the file where closing did not get that far
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish the file however the run ended: what was recorded up to an error is worth keeping, nothing is not."""

@@ -196,7 +196,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         self._once = LogOnce(_log)
         self._servers: list[Any] = []
         self._closed = False
-        atexit.register(self.close)
+        atexit.register(self.close)  # a node that does not leave is seen until its lease ends
 
     @abstractmethod
     def waiter(self) -> Waiter:
@@ -249,7 +249,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
             response = service.pack(answer(service.unpack(packed)))
             if service.reaches(caller):
                 service.respond(response, caller)
-        except Exception as error:  # noqa: BLE001 - a bad request is no reason to stop
+        except Exception as error:  # noqa: BLE001 - the server survives a bad request
             kind = f"{name} {type(error).__name__}"  # not its text, which a client can vary each time
             self._once.warning(kind, "%s: dropped a request: %s", name, str(error)[:200])
 

@@ -52,7 +52,7 @@ def _listed(value: Any) -> list[Any]:
 
 
 BOARD = "board"
-"""The one key that is no flag: the machine that a cell needs."""
+"""The one key that is not a flag: the machine that a cell needs."""
 Axis = Annotated[list[Any], Field(min_length=1)]
 RESERVED = {
     "seed": "the seed is a key at the top of the file; every repeat derives its own from it",

@@ -202,6 +202,7 @@ class Choice(Generic[O]):
     options: O
     variant: str = ""
     mode: str = ""
+    """The request mode: request or stream."""
     engine: str = ""
     cameras: int = 1
     state: int = 0

@@ -102,7 +102,7 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
     """
     host, port = split_address(address, scheme)
     bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of a server before are in TIME_WAIT
     try:
         bound.bind((host, int(port)))
         key = key_for(bound.getsockname()[0], options.api_key_env, no_auth=options.no_auth)

@@ -125,7 +125,7 @@ class Turns:
                 return
             self._running = following = self._waiting.popleft() if self._waiting else None
         if following is not None and following.ready is not None:
-            following.alive_ns = now_ns()
+            following.alive_ns = now_ns()  # else its wait would count as the silence of `silent_s`
             following.ready.set()
 
     @property
@@ -324,7 +324,7 @@ class Core:
             finally:
                 if turn is not None:
                     turn.leave()
-            exchange.held.close()
+            exchange.held.close()  # before `end`, which may wait for a slow client
             exchange.end()
         except Disconnected:
             return False

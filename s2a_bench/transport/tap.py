@@ -61,7 +61,7 @@ class TapReader:
     """Pairs the requests of one connection with its answers, in order; subclasses read `up` and `down`.
 
     A subclass calls `begin_request` at the first byte of a request and `end_request` at its last one, then
-    `begin_answer` and `end_answer`. What a server sends while no request waits, such as a greeting, is no answer.
+    `begin_answer` and `end_answer`. What a server sends while no request waits, such as a greeting, is not an answer.
     """
 
     def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
@@ -163,7 +163,7 @@ class Incoming:
         next(self._parser)
 
     def feed(self, data: bytes) -> None:
-        if self._unwanted > len(data):
+        if self._unwanted > len(data):  # bytes that nothing reads are not copied
             self._unwanted -= len(data)
             return
         data, self._unwanted = data[self._unwanted :], 0

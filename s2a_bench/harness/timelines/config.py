@@ -1,4 +1,4 @@
-"""The options that runs of plans share: which policies, and the requests for plans of a model."""
+"""The options that runs of answer plans share: the policies, and the requests for plans of a model."""
 
 from __future__ import annotations
 

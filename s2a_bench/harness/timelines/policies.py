@@ -1,4 +1,4 @@
-"""The knowledge of policies: of a board's tokens before the first one, and from plan to plan in executed runs."""
+"""What policies learn: from a board's tokens before the first one, and from plan to plan in executed runs."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class ControlOptions(Options):
         self.check_modes()
 
     def check_modes(self) -> None:
-        """Raise UsageError for a mode that is none, or that cannot act so."""
+        """Raise UsageError for an unknown acting mode, and for one that cannot act so."""
         _ = self.control
 
     def to_manifest(self) -> dict[str, Any]:

@@ -31,7 +31,7 @@ class Gym(TaskKind):
     """The environment ``env``, or PACKAGE:ID of a package that registers it when it is imported.
 
     Other parameters are keywords of ``gymnasium.make``. ``state`` and ``picture`` are keys of the observation; by
-    default the state is all of it, and the picture is rendered; ``none`` is no picture. An episode ends with the
+    default the state is all of it, and the picture is rendered; ``none`` sends no picture. An episode ends with the
     environment's, or at a success: ``info`` is the environment's word, ``terminated`` its end, ``survival`` none before
     its limit of steps, ``return`` a sum of rewards of ``least``. Before the first action it takes the neutral one, the
     nearest to 0; in a ``stall`` that, or the last action again. ``position=state[0:3]`` is what jerk and path are of,

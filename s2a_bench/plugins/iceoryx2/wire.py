@@ -186,7 +186,7 @@ def packed(part: AnswerPart) -> bytes:
 
 
 def unpacked(stream: bytearray) -> Iterator[AnswerPart]:
-    """Take whole lines off a stream; raises RequestFailed, ValueError, KeyError or TypeError for what is none."""
+    """Take whole lines off a stream; raises RequestFailed, ValueError, KeyError or TypeError for malformed ones."""
     end = stream.rfind(b"\n") + 1
     lines = bytes(stream[:end]).splitlines()
     del stream[:end]

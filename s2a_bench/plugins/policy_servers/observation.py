@@ -3,7 +3,7 @@
 It holds the nested dictionary that the policy expects; docs/policy-servers.md lists the texts in it that are
 placeholders. Pictures are uint8 (H, W, 3) RGB, the state is float32 (D,). A list of arrays becomes one array with one
 more axis in front: ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of
-text. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer` reads it. The
+text. The table `EXTENSION` is not part of the observation: it describes the server, as `ExternalServer` reads it. The
 files in ``templates`` beside this module are known by name.
 """
 

@@ -4,7 +4,7 @@ The thread serves services and the answers to cancels. One SingleThreadedExecuto
 Topics and actions have consumers that wait for themselves, as `rclpy.wait_for_message` does, because an executor makes
 its lists anew for each event and hands what came to another thread, which costs more than the message itself. Their
 entity is in a callback group that never executes, so that executors pass it by, and its consumer waits in a wait set of
-its own. Wait sets are no public part of rclpy; Humble's and Jazzy's are the same.
+its own. Wait sets are not a public part of rclpy; Humble's and Jazzy's are the same.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ def message_class(type_name: str) -> Any:
 
 
 def installed_version(action: Any, type_name: str) -> str:
-    """Return the version of llama_msgs that the workspace has; raises MissingInterface where it is none we know."""
+    """Return the version of llama_msgs that the workspace has; raises MissingInterface for an unknown one."""
     for version in ros.VERSIONS:
         if fits(action.Goal, type_name + "_Goal", version):
             return version

@@ -95,7 +95,7 @@ class ByteRelay:
                 server.close()
 
     def _client_of(self, wire: Wire) -> TappedClient:
-        """Return who connects: a client of that host whose connection has ended, else a new one."""
+        """Return the client that connects: one of that host whose connection has ended, else a new one."""
         host = wire.socket.getpeername()[0]
         with self._lock:
             self.totals.connections += 1

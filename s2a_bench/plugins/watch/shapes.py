@@ -42,7 +42,7 @@ def _plural(kind: str) -> str:
 
 
 def _values(value: Any) -> Iterator[tuple[str, int, int]]:
-    """Yield kind, count, and bytes as JPEG of what is no JPEG yet."""
+    """Yield kind, count, and the bytes as JPEG of pictures in other codings."""
     if isinstance(value, dict):
         for each in value.values():
             yield from _values(each)

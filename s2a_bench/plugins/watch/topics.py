@@ -136,7 +136,7 @@ def run_bag(config: WatchBag, output: Path, progress: Progress) -> Path:
     """Read both topics of a recording and return the run folder; raises S2AError, also if no exchange was seen.
 
     Times are those of the recording's log, on the clock of the system that recorded it: that may have been set
-    meanwhile, and is no CLOCK_MONOTONIC. `seconds` are counted from the recording's beginning.
+    meanwhile, and is not CLOCK_MONOTONIC. `seconds` are counted from the recording's beginning.
     """
     names, path = topic_names(config.in_, config.out), str(config.bag)
     reader = open_recording(path, "bag")
@@ -184,7 +184,7 @@ def _messages(reader: Any, path: str, ids: Container[int], seconds: float) -> It
 
 
 def topic_names(observations: str, answers: str) -> tuple[str, str]:
-    """Return both; raises UsageError for what is no topic, or twice the same."""
+    """Return both; raises UsageError for an invalid topic, or twice the same."""
     for field, name in (("in_", observations), ("out", answers)):
         if not ABSOLUTE.fullmatch(name):
             raise UsageError(f"`{field}`: '{name}' should look like /camera/image_raw, from the root")

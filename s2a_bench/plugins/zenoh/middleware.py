@@ -109,7 +109,7 @@ class ZenohSubscription:
         return None
 
     def _wanted(self, sample: Any) -> bool:
-        """Return True for a ROS message within its lifespan; log the first that is no ROS message."""
+        """Return True for a ROS message within its lifespan; log the first that is not a ROS message."""
         try:
             _, source_ns, self._sender = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
         except TransportError as error:

@@ -78,7 +78,7 @@ def _token(domain_id: int, session: str, number: int, kind: str, node_name: str)
 
 
 def entity_of(token: str) -> Entity | None:
-    """Read the token of an endpoint; None for a node's, and for what is none."""
+    """Read the token of an endpoint; None for a node's, and for anything else."""
     parts = token.split("/")
     if len(parts) != PARTS or parts[0] != ADMIN:
         return None
@@ -102,7 +102,7 @@ def attachment(sequence: int, gid: bytes) -> bytes:
 
 
 def attached(data: bytes) -> tuple[int, int, bytes]:
-    """Read an attachment: (sequence number, source time, gid); raises TransportError for what is none."""
+    """Read an attachment: (sequence number, source time, gid); raises TransportError for a malformed one."""
     if len(data) == ATTACHMENT.size:
         sequence, source_ns, size, gid = ATTACHMENT.unpack(data)
         if size == len(gid):

@@ -107,7 +107,7 @@ class Node:
     """One node of one session; callable from any thread."""
 
     def __init__(self, session: zenoh.Session, domain_id: int, name: str) -> None:
-        """Announce the node ``/namespace/name`` and listen for all others; raises UsageError for what is no name."""
+        """Announce the node ``/namespace/name`` and listen for all others; raises UsageError for an invalid name."""
         check_node_name(name)
         self.session, self.domain_id, self._name = session, domain_id, name
         self._id = str(session.zid())

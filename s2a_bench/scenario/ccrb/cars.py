@@ -20,7 +20,7 @@ NCAP_SPEED_MPS: Final = 50 * KMH
 LEAD_JERK_MPS3: Final = 6.0
 EGO_LEAST_MPS2: Final = -8.0
 LEAST_IMPACT_MPS: Final = 0.5
-"""Slower contacts are no impacts."""
+"""Slower contacts do not count as impacts."""
 SAFETY_M: Final = 2.0
 """Distance to the lead that the start deadline keeps."""
 CAR_WIDTH_M: Final = 2.0

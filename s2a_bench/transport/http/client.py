@@ -43,7 +43,7 @@ UNKNOWN_MODEL = re.compile(
 
 QUOTED = 200
 QUOTED_BYTES = 1 << 16
-"""Characters that are quoted of a body that is no error object."""
+"""Characters that are quoted of a body that is not an error object."""
 
 
 class HttpClient(Client):
@@ -211,7 +211,7 @@ class HttpClient(Client):
         except httpx.ConnectError as error:
             raise ServerDied(f"nothing answers at {url}: {error}") from error
         except httpx.TimeoutException as error:
-            bounds.left_s()
+            bounds.left_s()  # raises where the deadline, not the silence, was the shorter time-out
             raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}", starting=True) from error
         except httpx.RequestError as error:
             if not self._alive():

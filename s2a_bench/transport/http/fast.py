@@ -90,7 +90,7 @@ class FastServer(WebServer):
         return {"server": "a thread a connection", "http": "httptools", "version": httptools.__version__}
 
     def _answer_all(self, wire: Wire) -> None:
-        wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)
+        wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)  # Nagle would hold a token until the last is acknowledged
         early: bytes | None = b""
         try:
             while early is not None:
@@ -193,7 +193,7 @@ class FastExchange(ChatExchange):
         return self._wire.disconnected()
 
     def read(self) -> tuple[Request, bool]:
-        body, self._body = self._body, memoryview(b"")
+        body, self._body = self._body, memoryview(b"")  # freed once it is decoded, before the wait for the engine
         return self._reads(self._head.headers, body, self.trace, self._limits)
 
     def write(self, data: bytes, kind: str, *, last: bool) -> None:

@@ -96,7 +96,7 @@ class GenerateClient(RosClient):
         payload = self._wiring.options.payload
         images = [picture_message(frame, payload, self._offset_ns, trace)[1] for frame in request.images]
         sampling: dict[str, Any] = {"grammar": request.grammar}
-        if self._version != "4.4":
+        if self._version != "4.4":  # whose SamplingConfig has no seed
             sampling["seed"] = request.seed
         prompt = MEDIA_MARKER * len(images) + request.prompt
         packed = self._client.pack(llama.generate_goal(prompt, images, version=self._version, **sampling))
@@ -118,7 +118,7 @@ class GenerateClient(RosClient):
                     partial = self._client.unpack_feedback(event.packed).partial_response
                     bounds.count_bytes(len(partial.text))
                     heard.append(partial.text)
-                    if count == limit:
+                    if count == limit:  # sent before the server saw the cancel
                         continue
                     if not count:
                         trace.mark("server" if self._marks is None else "return")
@@ -157,7 +157,7 @@ class GenerateClient(RosClient):
         raise RequestFailed(f"no feedback for {self._wiring.timeout_s:.0f} s")
 
     def _learn(self, goal_id: str, trace: Trace) -> bool:
-        """Take our server's marks of a goal, which were sent before its result; of another, who it is."""
+        """Take our server's marks of a goal, which were sent before its result; of another server, its provenance."""
         if self._marks is None:
             if (marked := self._origin.take(0)) and (origin := wire.readable(self._origin, marked, trace)) is not None:
                 trace.provenance = wire.provenance_of(origin)

@@ -233,7 +233,7 @@ class CameraCache:
                 if packed is not None:
                     self._keep(camera, packed)
                     self._unused = ""
-            except Exception as error:  # noqa: BLE001 - an unusable frame is no reason to stop
+            except Exception as error:  # noqa: BLE001 - the camera survives an unusable frame
                 self._unused = str(error) or type(error).__name__
                 self._once.warning(self._unused, "camera frame not used: %s", self._unused)
 

@@ -36,7 +36,7 @@ def namespace_of(wiring: Wiring[RosOptions]) -> str:
 
 
 def domain_of(wiring: Wiring[RosOptions]) -> int:
-    """Return the DDS domain; raises UsageError for a ROS_DOMAIN_ID that is none."""
+    """Return the DDS domain; raises UsageError for an invalid ROS_DOMAIN_ID."""
     return domain_id(os.environ, wiring.options.domain_id)
 
 

@@ -22,7 +22,7 @@ PROVENANCE_TOPIC: Final = "/provenance"
 
 
 def readable(subscription: Subscription, packed: Any, trace: Trace) -> Any | None:
-    """Unpack a message; None for bytes that are none, which are counted as a fact: they are not this request's."""
+    """Unpack a message; None for malformed bytes, which are counted as a fact: they are not this request's."""
     try:
         return subscription.unpack(packed)
     except TransportError:

@@ -49,7 +49,7 @@ KEEP_S: Final = 0.2
 """Period in which requests are written while the robots act."""
 HEAD_START_S: Final = 0.2
 LATEST: Final = 0.05
-"""Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
+"""Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is not counted as measured."""
 
 
 def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> Path:
@@ -200,7 +200,7 @@ class _Cell:
             row = KneeRow(name, "measured", self.load.limit_text(limit), point.robots, point.low, point.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
-            what = f"{name}: {', '.join(map(str, late))} robots are no measurement: the generator was late or too slow"
+            what = f"{name}: {', '.join(map(str, late))} robots are not measured: the generator was late or too slow"
             advice = "spread the robots with --processes, send smaller pictures (--size), or quiet the machine"
             self.launch.warnings.append(RunWarning("generator-late", what, advice))
 

@@ -21,7 +21,7 @@ class Tried:
     within: bool
     """Whether the value itself keeps to the limit, decided or not."""
     clean: bool = True
-    """Whether the generator was in time; if not, it is no measurement."""
+    """Whether the generator was in time; if not, the fleet is not counted as measured."""
 
 
 @dataclass(frozen=True, slots=True)

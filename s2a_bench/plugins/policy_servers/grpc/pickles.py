@@ -28,7 +28,7 @@ Names: TypeAlias = Mapping[tuple[str, str], Any]
 
 HELPERS: Final = "lerobot.async_inference.helpers"
 OPCODES: Final = 20_000
-"""Most opcodes of a pickle; an action has 40, and a dictionary's key of so many tuples in each other is no danger."""
+"""Most opcodes of a pickle; an action has 40, and a dictionary's key of so many nested tuples is harmless."""
 NEEDED: Final = frozenset(
     {
         *("PROTO", "FRAME", "STOP", "MARK", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1"),

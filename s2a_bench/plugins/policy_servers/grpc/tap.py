@@ -5,7 +5,7 @@ A call is one exchange, from the first DATA byte of its request (headers may go 
 lerobot's `SendObservations` and `GetActions` are one exchange, from an observation to its chunk. Its robot sends more
 observations while it waits, most of which the server drops. A chunk belongs to the observation made at the time stamp
 of its first action, whose eight bytes stand at the head of that observation's pickle; if none has them, to the newest
-one that was sent whole. Older ones were dropped, and an answer without a chunk is no exchange. Observations are not
+one that was sent whole. Older ones were dropped, and an answer without a chunk is not an exchange. Observations are not
 decoded, as they are pickles.
 """
 

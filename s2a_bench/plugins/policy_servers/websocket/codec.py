@@ -5,7 +5,7 @@ An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"s
 them. Arrays are of numbers and texts: no objects (dtype kind O), no records (V), no complex numbers (c), which openpi
 refuses too.
 
-Our client says who it is in a header of its handshake, `MARKS_HEADER`. Then its observations have what
+Our client announces itself in a header of its handshake, `MARKS_HEADER`. Then its observations have what
 `observed` adds, and each answer is followed by one more frame with the server's marks.
 """
 

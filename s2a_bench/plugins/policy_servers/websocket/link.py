@@ -34,7 +34,7 @@ class Broken(RequestFailed):
     """The server has closed the connection, orderly or not."""
 
 
-class Link:
+class Connection:
     """A connection that fails in one line where more comes, or later, than the bounds of its request allow."""
 
     def __init__(

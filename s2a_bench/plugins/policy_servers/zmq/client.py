@@ -99,7 +99,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return body
 
     def _picture(self, frame: Frame, place: int, trace: Trace) -> Pixels:
-        """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
+        """Return a picture as it is sent; YUYV frames are converted straight into the send buffer."""
         if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
             return super()._picture(frame, place, trace)
         if len(self._files) > KEPT_FILES:

@@ -146,7 +146,7 @@ class ZmqServer:
                 send(_error(client_error(error)))
 
     def _check(self, message: Any) -> None:
-        """Raise RequestFailed for a message that is none, or has not the key, compared in constant time."""
+        """Raise RequestFailed for a malformed message, or one without the key, compared in constant time."""
         if not isinstance(message, dict):
             raise RequestFailed(f"a request is a map, not {type(message).__name__}")
         value = message.get(layouts.TOKEN)

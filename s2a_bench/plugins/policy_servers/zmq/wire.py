@@ -104,7 +104,7 @@ def read(data: Any) -> tuple[Any, set[str]]:
 
 
 def _array_in(fields: Mapping[str, Any]) -> Any:
-    """Return the read-only array, or scalar, in a map of msgpack-numpy; raises RequestFailed for what is none."""
+    """Return the read-only array, or scalar, in a map of msgpack-numpy; raises RequestFailed for anything else."""
     kind, descr, data = fields.get("kind") or b"", fields["type"], fields["data"]
     shape = fields.get("shape") if fields["nd"] else []
     kind = kind.decode("latin-1") if isinstance(kind, bytes) else kind
