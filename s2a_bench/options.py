@@ -20,7 +20,7 @@ from pydantic_core import ErrorDetails
 from s2a_bench.errors import UsageError
 from s2a_bench.text import like, none_of, read_text
 
-Made = TypeVar("Made", bound="Options")
+SomeOptions = TypeVar("SomeOptions", bound="Options")
 
 
 class Options(BaseModel):
@@ -46,7 +46,7 @@ class Options(BaseModel):
     def check(self) -> None:
         """Raise UsageError, naming the fields, for values that contradict each other."""
 
-    def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
+    def but(self: SomeOptions, **changes: Any) -> SomeOptions:  # noqa: PYI019 - typing has Self since Python 3.11
         """Return a copy with some fields changed, checked like a new one."""
         return type(self)(**self.given_values() | changes)
 

@@ -67,13 +67,13 @@ def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
 def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:
     """Read TOML text; ``where`` begins every error. Raises UsageError."""
     if _DEEP.search(text):
-        raise UsageError(f"{where}: no TOML that can be read: it has a dotted key of more than 32 names")
+        raise UsageError(f"{where}: not TOML that can be read: it has a dotted key of more than 32 names")
     try:
         return tomllib.loads(text, parse_float=parse_float)
     except RecursionError:
-        raise UsageError(f"{where}: no TOML that can be read: its arrays or tables are too deep") from None
+        raise UsageError(f"{where}: not TOML that can be read: its arrays or tables are too deep") from None
     except ValueError as error:  # a TOMLDecodeError, or a whole number of thousands of digits
-        raise UsageError(f"{where}: no TOML: {error}") from error
+        raise UsageError(f"{where}: not TOML: {error}") from error
 
 
 def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], Any] = float) -> T:

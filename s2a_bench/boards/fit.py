@@ -78,7 +78,7 @@ def fit_markov(rows: Rows) -> Markov:
     pause = np.zeros_like(logs)
     for _ in range(_EM_STEPS):
         odds = np.log((1 - share) / share) + ((logs - high) ** 2 - (logs - low) ** 2) / (2 * variance)
-        pause = 1 / (1 + np.exp(np.clip(odds, -500, 500)))
+        pause = 1 / (1 + np.exp(np.clip(odds, -500, 500)))  # exp overflows above 709
         share = float(np.clip(pause.mean(), 1e-6, 1 - 1e-6))
         low = np.average(logs, weights=1 - pause + 1e-12)
         high = np.average(logs, weights=pause + 1e-12)

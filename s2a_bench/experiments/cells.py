@@ -112,7 +112,6 @@ class Column:
 
 @cache
 def columns_of(row: type) -> tuple[Column, ...]:
-    """Return the columns that a dataclass of rows declares."""
     hints, as_stored = get_type_hints(row, include_extras=True), getattr(row, "as_stored", False)
     columns = []
     for name, kind in kinds_of(row).items():

@@ -11,15 +11,7 @@ from typing import Any, TypeAlias
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import clock_id, now_ns
-from s2a_bench.errors import (
-    EngineError,
-    RequestFailed,
-    S2AError,
-    ServerDied,
-    SourceError,
-    TransportError,
-    UsageError,
-)
+from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, TransportError, UsageError
 from s2a_bench.facts import (
     CACHE_N,
     CAMERA_FRAMES,

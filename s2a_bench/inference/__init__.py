@@ -184,8 +184,7 @@ class EngineConfig(Options):
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path", names=profile_files)
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
     latency: Written = option(
-        "",
-        "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
+        "", "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]"
     )
     model: Path | None = option(None, "GGUF, name, or hub:OWNER/REPO[:FILE] [default: the tiny dummy]", first=True)
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")

@@ -38,13 +38,7 @@ from s2a_bench.inference import (
     EngineConfig,
     llama_log,
 )
-from s2a_bench.inference.llama_decode import (
-    GrammarSampler,
-    TokenBatch,
-    TokenBytes,
-    beyond_limits,
-    grammar_error,
-)
+from s2a_bench.inference.llama_decode import GrammarSampler, TokenBatch, TokenBytes, beyond_limits, grammar_error
 from s2a_bench.inference.llama_prompt import ChatTemplate, TooLong, VisionTower, evaluate_text
 from s2a_bench.inference.models import load_headers
 from s2a_bench.types import Frame, Request, Token

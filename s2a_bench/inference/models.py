@@ -218,7 +218,7 @@ def sha256(path: Path) -> str:
     with path.open("rb") as content:
         while block := content.read(1 << 22):
             computed.update(block)
-    with suppress(OSError):
+    with suppress(OSError):  # without the note it is computed again
         note.parent.mkdir(parents=True, exist_ok=True)
         note.write_text(json.dumps({"path": str(path.resolve()), "sha256": computed.hexdigest()}))
     return computed.hexdigest()

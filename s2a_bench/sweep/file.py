@@ -42,7 +42,7 @@ def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int
     """
     for repeat in range(1, repeats + 1):
         order = list(items)
-        Random(f"{seed}/{repeat}").shuffle(order)  # noqa: S311 - an order, no secret
+        Random(f"{seed}/{repeat}").shuffle(order)  # noqa: S311 - an order, not a secret
         for item in order:
             yield repeat, item
 

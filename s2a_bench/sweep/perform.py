@@ -167,7 +167,7 @@ class RayWorkers(CellWorkers):
         except self._ray.exceptions.RayError as error:
             return Outcome(f"Ray gave up: {str(error).splitlines()[0]}", 0.0, manifests.utc_now(), collect())
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
-            archive.extractall(folder, filter="data")
+            archive.extractall(folder, filter="data")  # it refuses members that lead out of the folder
         return outcome
 
     def __exit__(self, *_: object) -> None:

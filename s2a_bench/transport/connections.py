@@ -73,7 +73,7 @@ class Connections:
             self._wires[wire] = thread
         try:
             thread.start()
-        except RuntimeError:
+        except RuntimeError:  # the limit of threads is reached
             self._close(wire)
             raise
         if self._stopped:  # `stop` may have gone through the connections before this one was among them
@@ -119,7 +119,7 @@ class Wire:
         if unsent:
             del unsent[:sent]
         else:
-            unsent += memoryview(data)[sent:]
+            unsent += memoryview(data)[sent:]  # a view: a slice of bytes would be a copy
 
     def flush(self, left_s: float) -> None:
         """Send the rest, and wait for the client up to this time; raises Disconnected."""

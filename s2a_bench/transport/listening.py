@@ -91,7 +91,7 @@ def is_loopback(host: str) -> bool:
     """Return True for localhost and an address of loopback; no name is resolved."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
+    except ValueError:  # a name
         return False
 
 
@@ -128,7 +128,7 @@ def check_url(url: str, schemes: Collection[str]) -> None:
     try:
         address = urlsplit(url)
         valid = address.scheme in schemes and bool(address.hostname) and address.port != 0
-    except ValueError:
+    except ValueError:  # of a malformed port or IPv6 address
         valid = False
     if not valid:
         shown = re.sub(r"[^/]*@", "***@", url.partition("?")[0])

@@ -225,5 +225,4 @@ class ParsedTapReader(TapReader):
         self._down.feed(data)
 
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
-        """Read messages without end."""
         raise NotImplementedError

@@ -86,7 +86,7 @@ def write(folder: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("command = ", "no TOML"),
+        ("command = ", "not TOML"),
         ('comand = "timeline"', "comand: there is no such key; did you mean command?"),
         ("repeats = 2", "command: is missing"),
         ("command = 3", "command: 3 should be a text"),

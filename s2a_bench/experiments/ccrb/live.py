@@ -53,8 +53,6 @@ CRUISE_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class CcrbLivePlan:
-    """Drives on a model's tokens."""
-
     scenario: CcrbOptions
     requests: RunPlan
     prompt: PlanPrompt

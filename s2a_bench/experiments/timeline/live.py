@@ -34,8 +34,6 @@ from s2a_bench.store.requests import SKILLS
 
 @dataclass(frozen=True, slots=True)
 class LivePlan:
-    """A run of timelines on a model's plans."""
-
     requests: RunPlan
     prompts: Sequence[PlanPrompt]
     learning: LearningPlan

@@ -58,7 +58,6 @@ def draw(scene: Scene, at_ns: int, width: int) -> Group:
 
 
 def summary(record: Record) -> str:
-    """Return how a plan ended, as text."""
     stalls = _stalls_s(record)
     if not record.skills or record.requested_ns is None:
         return f"{record.outcome}, nothing was started" + (f": {record.why}" if record.why else "")

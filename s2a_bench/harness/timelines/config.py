@@ -39,10 +39,7 @@ class PlanRequests(FirstVariants):
     COMPUTES: ClassVar[str] = "a plan takes a model's time"
 
     transports: Names = option(
-        (FOLLOWED,),
-        "ros, ros/action, http, http/VARIANT, loopback: one, as in latency",
-        flag="transport",
-        names=paths,
+        (FOLLOWED,), "ros, ros/action, http, http/VARIANT, loopback: one, as in latency", flag="transport", names=paths
     )
     engine: EngineConfig = group(
         EngineConfig,

@@ -88,13 +88,12 @@ def act(
                 launch.progress.stage("waiting for the last answer")
         finally:
             loop.stop()
-    _keep(requester, launch)
+    _keep(requester, launch)  # first, as `join` raises the loop's error
     loop.join()
     return acting, requester
 
 
 def frame_of(pixels: Pixels, index: int, stamp_ns: int) -> Frame:
-    """Return a robot's picture as the frame of a request."""
     height, width, _ = pixels.shape
     return Frame(index, stamp_ns, width, height, "rgb8", pixels)
 

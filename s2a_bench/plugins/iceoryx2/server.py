@@ -66,6 +66,7 @@ class Iceoryx2Server:
         """Return the source of requests, and the listener that they wake; raises an error of iceoryx2."""
         clients = min(CLIENTS, limits.connections)
         service = self._domain.requests(self.address).max_servers(1).max_clients(clients).max_nodes(clients + 1)
+        # Overflow that is "safe" loses silently: an unread answer is replaced by a newer one.
         service = service.enable_safe_overflow_for_requests(False).enable_safe_overflow_for_responses(False)
         service = service.max_active_requests_per_client(ACTIVE).max_loaned_requests(1)
         service = service.max_response_buffer_size(2 * UNREAD)

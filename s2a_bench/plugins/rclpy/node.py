@@ -76,7 +76,7 @@ class SpinningNode:
         while not self._closing.is_set():
             try:
                 self._executor.spin_once()
-            except ExternalShutdownException:
+            except ExternalShutdownException:  # rclpy was shut down elsewhere in this process
                 return
             except Exception:  # noqa: BLE001 - whatever a callback raised ends in spin_once
                 _log.exception("a callback of rclpy failed")

@@ -232,7 +232,7 @@ class RemoteClock:
 
 
 @dataclass(slots=True)
-class Asked:
+class ClockProgram:
     """A program that knows the error of the wall clock."""
 
     system: str
@@ -275,5 +275,5 @@ def ptp_error_s(text: str) -> float:
     return (abs(offset_ns) + delay_ns) / 1e9
 
 
-CHRONY: Final = Asked("chrony", ("chronyc", "-c", "tracking"), chrony_error_s)
-PTP: Final = Asked("ptp", ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"), ptp_error_s)
+CHRONY: Final = ClockProgram("chrony", ("chronyc", "-c", "tracking"), chrony_error_s)
+PTP: Final = ClockProgram("ptp", ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"), ptp_error_s)

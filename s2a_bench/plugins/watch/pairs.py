@@ -94,6 +94,6 @@ class Pairs:
     def _close(self) -> None:
         if seen := self._open:
             self._open = None
-            if seen.pieces_ns == [seen.answer_ns]:
+            if seen.pieces_ns == [seen.answer_ns]:  # an answer in one message is not a stream
                 seen.pieces_ns.clear()
             self._report(seen)

@@ -111,7 +111,7 @@ class ByteRelay:
 
     def _join(self, client: TappedClient, robot: socket.socket, server: socket.socket) -> None:
         for each in (robot, server):
-            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # the relay itself must hold nothing back
         passed = Passed(self.reader(lambda seen: self.report(client.number, seen), self._kinds), self._failed)
         down = Thread(target=_pass, args=(server, robot, passed), kwargs={"up": False}, name="down", daemon=True)
         down.start()
@@ -190,7 +190,7 @@ def _pass(source: socket.socket, target: socket.socket, passed: Passed, *, up: b
             passed.read()
     except OSError:
         how = socket.SHUT_RDWR
-        with suppress(OSError):
+        with suppress(OSError):  # it may be closed already
             source.shutdown(how)
     with suppress(OSError):
         target.shutdown(how)

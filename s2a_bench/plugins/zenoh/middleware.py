@@ -163,6 +163,7 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
                 query.drop()
 
         with refusals(spec.name):
+            # Complete, as rmw_zenoh's clients send requests to complete queryables only.
             self._queryable = node.session.declare_queryable(self._key, direct(put), complete=True)
         self._seen = node.announce(names.SERVICE, spec.name, spec.type_name, spec.version, qos)
 

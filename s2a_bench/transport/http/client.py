@@ -194,7 +194,6 @@ class HttpClient(Client):
             trace.marks.append(("server", first_ns))
 
     def _events(self, response: HttpResponse, body: Iterator[bytes]) -> Iterator[Event]:
-        """Yield the events of an answer."""
         if response.headers.get("content-type") == native.BLOCKS:
             decoder = Decoder(self._dialect, native.read_block, native.Blocks)
         else:
@@ -237,7 +236,7 @@ def _beginning(body: Iterator[bytes]) -> Iterator[bytes]:
 def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, expected: str) -> RequestFailed:
     try:
         value = json.loads(body)
-    except (ValueError, RecursionError):
+    except (ValueError, RecursionError):  # it is not JSON, or is nested too deep
         value = None
     message = error_in(value) or struck(body)[:QUOTED].strip() or "nothing"
     kind = response.headers.get("content-type", "no content type").partition(";")[0]

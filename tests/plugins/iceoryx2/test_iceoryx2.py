@@ -290,7 +290,7 @@ class Foreign:
         (lambda _: b"abc", "sent a malformed answer"),
         (lambda number: SLICE.pack(number, 0) + b'["token", 0', "broke off"),
         (lambda number: SLICE.pack(number, 0) + b'["token", 0, 1, 2]\n', "a line of an unknown kind"),
-        (lambda number: SLICE.pack(number, 0) + b'["action", 0, ["x"]]\n', "no array of numbers|not numbers"),
+        (lambda number: SLICE.pack(number, 0) + b'["action", 0, ["x"]]\n', "not an array of numbers|not numbers"),
         (lambda number: SLICE.pack(number, 0) + b"{]\n", "sent a malformed answer"),
         (lambda number: SLICE.pack(number, 0) + packed("the engine has had enough"), "had enough"),
         (lambda number: SLICE.pack(number, 1) + packed(Token(1, "b")), "pieces of the answer of foreign were lost"),

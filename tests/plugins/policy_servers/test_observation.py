@@ -160,7 +160,7 @@ def test_toml_and_json_say_the_same(tmp_path: Path, name: str, text: str) -> Non
         ("a.json", "{", "not JSON"),
         ("a.json", '{"a": 1, "a": 2}', "a key is twice there"),
         ("a.json", "[" * 50_000, "too deep"),
-        ("a.toml", "a = ", "no TOML"),
+        ("a.toml", "a = ", "not TOML"),
         ("a.toml", "a = 2020-01-01", "which no observation can hold"),
     ],
 )

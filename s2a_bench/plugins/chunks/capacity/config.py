@@ -64,7 +64,7 @@ class RobotLoad:
     mode: Mode | None = None
     """None: robots without a control clock."""
     name: str = ""
-    """The canonical name of the mode."""
+    """The canonical name of the acting mode."""
     seed: int = 0
     every_ns: int = 0
     """The period of a robot's plans; 0 and no mode: closed loop."""

@@ -214,8 +214,6 @@ class _Shared(Stamped):
 
 
 class Fleet:
-    """The robots of this process."""
-
     def __init__(self, plan: FleetPlan) -> None:
         self._plan = plan
         self._stack = ExitStack()
@@ -336,7 +334,7 @@ class FleetProcess(RemoteFleet):
         theirs.close()
 
     def close(self) -> None:
-        with suppress(OSError):
+        with suppress(OSError):  # it may have ended
             self._pipe.send(("close", ()))
         self._process.join(2 * PATIENCE_S)
         self._process.kill()

@@ -105,7 +105,7 @@ def _drive(loads: Sequence[RobotLoad], plan: SearchPlan, processes: int, ray: An
 
 @dataclass(slots=True)
 class _Cell:
-    """The fleets of one pipeline and mode."""
+    """The fleets of one pipeline and acting mode."""
 
     load: RobotLoad
     search: SearchPlan
@@ -181,7 +181,6 @@ class _Cell:
         return Tried(number, verdict, within, clean)
 
     def _write(self, about: AboutRobot, trace: RobotTrace) -> None:
-        """Write what one robot did, in one episode."""
         settle_ns, writer = self.load.settle_ns, self.launch.writer
         writer.append(ROBOTS, [RobotRow(**vars(about), **vars(measures([trace], self.load.setting, settle_ns)))])
         since_ns = (trace.request_ns - trace.start_ns).tolist()

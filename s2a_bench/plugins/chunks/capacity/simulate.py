@@ -23,8 +23,6 @@ UNKNOWN: Final = -1
 
 
 class ServiceTime(NamedTuple):
-    """The time of one answer, in ns."""
-
     first_ns: int
     """Time from the start of its service to its first piece, or `UNKNOWN`."""
     whole_ns: int

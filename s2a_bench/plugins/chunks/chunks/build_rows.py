@@ -220,7 +220,6 @@ def _plain(values: Mapping[str, float | None]) -> dict[str, Any]:
 
 
 def trigger_rows(mode: Mode, setting: ControlSetting, latencies: LatencyDraw) -> Iterator[TriggerRow]:
-    """Yield a row for every trigger of a mode."""
     length = mode.execution_horizon(setting)
     for ticks in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
         tried = mode.varied((ticks,))

@@ -1,4 +1,4 @@
-"""The cells: each mode as given, and the first mode with a trigger once more under each rule."""
+"""The cells: each acting mode as given, and the first one with a trigger once more under each rule."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class LatencyDraw:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActingCell:
-    """One mode under one source; ``triggers`` are a rule's, one a request."""
+    """One acting mode under one source; ``triggers`` are a rule's, one a request."""
 
     mode: Mode
     name: str
@@ -114,7 +114,7 @@ def cells(control: ControlPlan, rules: RulesPlan, latencies: LatencyDraw) -> Ite
 
 
 def changes(setting: ControlSetting, name: str, latencies: LatencyDraw) -> list[RunWarning]:
-    """Return whether the delays of judged latencies, in ticks, differ from those that a rule learned from."""
+    """Return warnings if the delays of judged latencies, in ticks, differ from those that a rule learned from."""
     learned, seen = (Rows(setting.delay_ticks(each).astype(float)) for each in (latencies.learnt, latencies.judged))
     return change_warnings(name, learned, seen, "control ticks", f"calibrate anew, or {FOLLOW}")
 

@@ -1,4 +1,4 @@
-"""The live run: every mode acts at control rate on a server's answers; the metrics are those of virtual time.
+"""The live run: every acting mode runs at control rate on a server's answers; the metrics are those of virtual time.
 
 A latency counts from the start of the tick of a request until its chunk is complete.
 """
@@ -34,7 +34,7 @@ from s2a_bench.progress import Progress
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveResult:
-    """The actions of a mode over a pipeline; ``triggers`` are those that its rule chose."""
+    """The actions of an acting mode over a pipeline; ``triggers`` are those that its rule chose."""
 
     cell: ActingCell
     setting: ControlSetting

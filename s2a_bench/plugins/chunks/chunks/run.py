@@ -1,4 +1,4 @@
-"""The run of chunks in virtual time: modes and rules under the same latencies, varied triggers and mean latencies."""
+"""The run of chunks in virtual time: acting modes and rules under the same latencies, varied triggers and means."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
         fields = {"timestamp": stamp, "timestep": self._timestep, "observation": observation, "must_go": True}
         body = memoryview(pickled("TimedObservation", fields))
         starts = range(0, len(body), PIECE_BYTES)
-        states = [BEGIN, *[MIDDLE] * (len(starts) - 2), END][-len(starts) :]
+        states = [BEGIN, *[MIDDLE] * (len(starts) - 2), END][-len(starts) :]  # a single piece is END alone
         pieces = [
             bytes((8, state)) + message_of(body[start : start + PIECE_BYTES], 2)
             for state, start in zip(states, starts, strict=True)

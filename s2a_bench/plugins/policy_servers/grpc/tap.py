@@ -121,7 +121,7 @@ class GrpcReader(ParsedTapReader):
         if call is None:
             return
         call.seen.error = error
-        if len(call.seen.pieces_ns) == 1:
+        if len(call.seen.pieces_ns) == 1:  # an answer in one message is not a stream
             call.seen.pieces_ns.clear()
         if call.seen.what == GET and (error or call.seen.down_bytes > PREFIX):
             self._got(call)

@@ -135,7 +135,7 @@ class WebsocketServer(WebServer):
             while True:
                 self._answer(client, connection.recv())
                 self._answering.discard(client)
-        except (ConnectionClosed, Disconnected):
+        except (ConnectionClosed, Disconnected):  # a client that leaves is not a failure
             pass
         except Exception:
             _log.exception("a connection failed")

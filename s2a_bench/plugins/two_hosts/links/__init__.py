@@ -130,7 +130,7 @@ def _configure(tun: int, own: str, peer: str) -> None:
     """Give a new device a loopback address in place of ``lo``, so that servers bind where they always do."""
     fcntl.ioctl(tun, TUNSETIFF, struct.pack("16sH22x", DEVICE, IFF_TUN | IFF_NO_PI))
     conf = Path("/proc/sys/net")
-    (conf / "ipv4/conf/link/route_localnet").write_text("1")
+    (conf / "ipv4/conf/link/route_localnet").write_text("1")  # else the kernel drops 127/8 on a device that is not lo
     with suppress(OSError):  # a kernel without IPv6
         (conf / "ipv6/conf/all/disable_ipv6").write_text("1")
 
