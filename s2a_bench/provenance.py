@@ -90,7 +90,7 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
-        """Read the entry of a manifest or a peer; a field that is missing or no text has its default."""
+        """Read the entry of a manifest or a peer; a field that is missing or not text has its default."""
         return cls(**{name: _text(value) for name in _FIELDS if isinstance(value := values.get(name), str) and value})
 
     def to_dict(self) -> dict[str, str]:

@@ -93,7 +93,7 @@ def stop_soon(server: Server) -> None:
         SystemClock().sleep_until_ns(now_ns() + round(GRACE_S * 1e9))
         sys.stderr.write(f"the server still runs {GRACE_S:g} s after its stop: killed\n")
         sys.stderr.flush()
-        os._exit(0)
+        os._exit(0)  # `sys.exit` would end this thread alone
 
     Thread(target=stop, daemon=True).start()  # a signal's handler may have interrupted a lock's holder
 

@@ -246,7 +246,7 @@ class Session:
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
         rgb_source = together(fingerprint(to_rgb(frame)) for frame in frames) if frames else None
-        rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
+        rgb_engine = _whole(facts.pop(RGB_ENGINE, None))  # it becomes a column
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
         age_ns = started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None
@@ -294,6 +294,7 @@ class Session:
                 engine_lo_ns=left_ns - joined.early_ns if joined and left_ns else None,
                 engine_hi_ns=min(left_ns + joined.late_ns, client_ns) if joined and left_ns else None,
             )
+            # A server that reports no times, or fewer than tokens, leaves null.
             for (token, client_ns), left_ns in zip(seen, chain(engine_ns, repeat(None)), strict=False)
         ]
         return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
@@ -314,6 +315,7 @@ class Session:
         if self.feed.sink is not None:
             used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
             if used is not None and trace.remote is not None:
+                # Once: the frame may be the newest for several answers.
                 if not used.used_by and trace.remote.clock == clock_id():
                     used.marks = [*used.marks, *trace.remote.frame_marks]
                     used.clock_error_ns = max(joined.early_ns, joined.late_ns) if joined else None

@@ -68,6 +68,7 @@ class Iceoryx2Client(Client):
         server = domain.event(self._name).open()
         wake = server.notifier_builder().create()
         builder = domain.requests(self._name).open().client_builder().initial_max_slice_len(MIB)
+        # A request that finds the server's queue full is discarded instead of waiting, which `_answer` notices.
         builder = builder.backpressure_strategy(iceoryx2.BackpressureStrategy.DiscardData)
         port = builder.allocation_strategy(iceoryx2.AllocationStrategy.PowerOfTwo).create()
         for _ in range(secrets.randbelow(USED)):

@@ -82,7 +82,7 @@ class ByteRelay:
         client, server = self._client_of(wire), None
         try:
             server = socket.create_connection(self.server, CONNECT_S)
-            server.settimeout(None)
+            server.settimeout(None)  # that of the connect would end silent connections
             self._joined[server] = current_thread()
             self._join(client, wire.socket, server)
         except OSError as error:

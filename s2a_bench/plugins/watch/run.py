@@ -91,7 +91,7 @@ class Watch:
         self.writer.tokens(tokens_of(row, seen, number))
         self.view.rows.append(row)
         if seen.observation is not None:
-            with suppress(RecursionError):
+            with suppress(RecursionError):  # it may be nested too deep to be described
                 self.view.sends[row.cell] = described(seen.observation)
                 self.writer.update(sends=dict(self.view.sends))
 

@@ -48,9 +48,9 @@ class Head:
         except httptools.HttpParserUpgrade:
             pass  # a server may ignore it (RFC 9110, 7.8)
         except httptools.HttpParserError as error:
-            raise Refused(HTTPStatus.BAD_REQUEST, f"no HTTP request: {error}") from error
+            raise Refused(HTTPStatus.BAD_REQUEST, f"not an HTTP request: {error}") from error
         if not self._complete:
-            raise Refused(HTTPStatus.BAD_REQUEST, "no HTTP request")
+            raise Refused(HTTPStatus.BAD_REQUEST, "not an HTTP request")
         self.method, self.path = parser.get_method(), self._url.partition(b"?")[0].decode("latin-1")
         self.chunked = parser.get_http_version() == "1.1"
         self.keep = self.chunked and "close" not in self.value("connection").lower()

@@ -239,7 +239,7 @@ class CameraCache:
 
     def _follow(self, clock: Subscription) -> None:
         while not self._stopped:
-            with suppress(TransportError):
+            with suppress(TransportError):  # of a message that cannot be read; the next may be
                 if (packed := clock.take(POLL_S)) is not None:
                     self._sim_ns = ros.nanoseconds(clock.unpack(packed).clock)
 

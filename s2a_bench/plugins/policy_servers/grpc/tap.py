@@ -79,7 +79,7 @@ class GrpcReader(ParsedTapReader):
 
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
         if up and (yield from incoming.read(len(PREFACE))) != PREFACE:
-            raise ValueError("no HTTP/2")
+            raise ValueError("not HTTP/2")
         decoder = Decoder(HEADERS_BYTES)
         decoder.max_allowed_table_size = HEADERS_BYTES
         while True:
