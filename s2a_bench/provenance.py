@@ -103,7 +103,7 @@ class Provenance:
 
     @property
     def over(self) -> str:
-        """Return what a cell's name lacks of an emulated link: " over 4g"; else empty."""
+        """Return an emulated link as an addition to a cell's name, " over 4g"; else empty."""
         name = self.link_profile.partition(" (")[0]
         return f" over {name}" if name else ""
 

@@ -82,7 +82,7 @@ def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], An
 
 
 def checked(table: type[T], content: Any, where: str) -> T:
-    """Return what was read of TOML or JSON as a table; raises UsageError as `parse` does."""
+    """Return values read from TOML or JSON as a table; raises UsageError as `parse` does."""
     try:
         return table.model_validate(content)
     except ValidationError as error:

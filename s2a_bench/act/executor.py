@@ -131,7 +131,7 @@ class Executor:
             self._fail("skill-failed", f"{self.record.skills[index].call}: {error}")
 
     def _act(self, due_ns: int) -> int | None:
-        """Do all that is due since ``due_ns``; return when to act again, None at the end."""
+        """Act on everything that is due since ``due_ns``; return when to act again, None at the end."""
         record = self.record
         while record.outcome is None:
             now_ns = self._clock.now_ns()

@@ -65,7 +65,7 @@ def check_name(name: str, advice: str = "") -> None:
 
 
 def bars_of(name: str, figure: str) -> GreyBars:
-    """Return what a reference has beside a figure; nothing if ``name`` is empty."""
+    """Return the numbers that a reference has beside a figure; none if ``name`` is empty."""
     where = REFERENCES[name].bars.get(figure) if name else None
     reference_bars: GreyBars = resolve_name(where) if where else GreyBars()
     return reference_bars

@@ -149,7 +149,7 @@ def _is_named(config: RequestsConfig, cell: Pipeline, others: Sequence[Pipeline]
 
 
 def resolve(config: RequestsConfig, say: Callable[[str], None]) -> RunPlan:
-    """Decide what follows from a configuration, and ``say`` what is chosen; opens and starts nothing.
+    """Derive the run plan from a configuration, and ``say`` what is chosen; opens and starts nothing.
 
     Raises MissingExtra if a library that the engine or a server program needs is not installed.
     """

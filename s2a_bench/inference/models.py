@@ -113,7 +113,7 @@ class ModelFiles:
         return any(header.is_dummy for header in (self.model, self.mmproj) if header)
 
     def describe(self) -> dict[str, str | bool]:
-        """Return what a manifest tells of the files; the first call hashes them, which takes seconds for gigabytes."""
+        """Return a manifest's facts about the files; the first call hashes them, which takes seconds for gigabytes."""
         facts: dict[str, str | bool] = {"dummy": self.dummy, "name": str(self.model.fields.get("general.name", ""))}
         for kind, header in (("model", self.model), ("mmproj", self.mmproj)):
             if header:

@@ -257,7 +257,7 @@ class Middleware(Protocol):
         """
 
     def describe(self) -> dict[str, str | int]:
-        """Return what carries the messages: implementation, version, domain, configuration."""
+        """Return the facts of the middleware: implementation, version, domain, configuration."""
 
     def close(self) -> None:
         """Leave the domain at once, so that peers need not wait for the lease; may be called twice."""
@@ -307,7 +307,7 @@ class MiddlewareKind:
         return self.dds or environ.get("RMW_IMPLEMENTATION") or config.DEFAULT_RMW
 
     def place_in(self, options: object) -> str:
-        """Return what options or parameters say about its meeting place; "" for nothing, or if it has none."""
+        """Return its meeting place as options or parameters name it; "" if they do not, or if it has none."""
         return str(getattr(options, self.meeting_place.option)) if self.meeting_place else ""
 
     def builds(self, action: str) -> bool:
@@ -340,14 +340,14 @@ def middleware_kind(name: str = "") -> MiddlewareKind:
 
 
 def way_out(kind: MiddlewareKind) -> str:
-    """Return what to do where a middleware is not installed: also each other one that pip installs."""
+    """Return the way out where a middleware is not installed: also each other one that pip installs."""
     extras = {name: other.extra for name, other in MIDDLEWARES.loaded() if other != kind and other.extra}
     others = (f"--middleware {name} ({how_to_install(extra)})" for name, extra in extras.items())
     return ", or ".join((kind.way_out, *others))
 
 
 def loss_advice(dds: str) -> str:
-    """Return what the middleware that speaks like ``dds`` says against loss; "" for datagrams."""
+    """Return the advice against loss of the middleware that speaks like ``dds``; "" for datagrams."""
     return next((kind.against_loss for _, kind in MIDDLEWARES.loaded() if kind.dds == dds), "")
 
 

@@ -79,7 +79,7 @@ FEEDBACK_QOS: Final = QoS(depth=1000)
 STATUS_QOS: Final = QoS(depth=1, latched=True)
 HOUSEKEEPING_NS: Final = 500_000_000
 WAITING_AT_MOST: Final = 1000
-"""So many requests for one goal's result are remembered; more are not answered."""
+"""The most requests for one goal's result that are remembered; more are not answered."""
 LISTED_ENDED: Final = 64
 """The status array lists all live goals and so many of the latest that ended."""
 FEEDBACK_ID: Final = slice(4, 20)
@@ -172,7 +172,7 @@ class Goals:
             del self._ended[goal.id]
 
     def listed(self) -> list[Goal]:
-        """Return what the status array shows, in order of acceptance."""
+        """Return the goals that the status array shows, in order of acceptance."""
         latest = islice(reversed(self._ended.values()), LISTED_ENDED)
         return sorted((*self._live.values(), *latest), key=lambda goal: goal.stamp_ns)
 
@@ -203,7 +203,7 @@ class ClientAction:
         # Readers are announced in order: a server that knows the reply readers below knows the feedback reader too.
         feedback = node.subscription(prefix + "feedback", type_name + "_FeedbackMessage", READER_QOS, version, waiter)
         status = node.subscription(prefix + "status", STATUS_ARRAY, STATUS_QOS)
-        """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
+        """The status topic, which is not read: a goal's status comes with its result. ROS tools expect a subscriber."""
         send_goal, get_result, cancel_goal = _services(name, type_name, version)
         self._goals = node.client_end(send_goal, waiter)
         self._results = node.client_end(get_result, waiter)

@@ -39,7 +39,7 @@ from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
 WRITERS_AT_MOST = 4096
-"""So many changes among the writers of a domain are taken at once."""
+"""The most changes among the writers of a domain that are taken at once."""
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 
 
@@ -174,7 +174,7 @@ class _Endpoint:
         return len(self.peers())
 
     def endpoint(self, handle: int) -> Any:
-        """Return what is known of one matched peer, a DcpsEndpoint; None if it has left, even while this was read."""
+        """Return the description of one matched peer, a DcpsEndpoint; None if it has left, even during this call."""
         try:
             with _reading:
                 return self._read_peer(handle)
@@ -235,7 +235,7 @@ class RawReader(_Endpoint):
                 return loan.view()
 
     def arrived(self) -> Iterator[memoryview]:
-        """Take what has arrived, `AT_ONCE` samples at most: a writer may send faster than we take."""
+        """Take the samples that have arrived, `AT_ONCE` at most: a writer may send faster than we take."""
         return islice(iter(self.take, None), AT_ONCE)
 
     def sender(self) -> int:
@@ -243,7 +243,7 @@ class RawReader(_Endpoint):
 
 
 def writers_of(participant: DomainParticipant) -> Callable[[], list[Any]]:
-    """Return what knows the writers of the domain; keep it, as Cyclone gives back no memory of a reader.
+    """Return a function that lists the writers of the domain; keep it, as Cyclone gives back no memory of a reader.
 
     Nor does it of a writer's QoS that was read: each change is taken once.
     """

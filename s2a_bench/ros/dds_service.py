@@ -131,7 +131,7 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
         self._clients: dict[int, tuple[str, str]] = {}
 
     def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
-        """Take what has arrived, a bounded number; of what is too short for a header, the header is zero."""
+        """Take the samples that have arrived, a bounded number; the header of one too short to have one is zero."""
         for packed in self.reader.arrived():
             header = HEADER.unpack_from(packed, HEADER_AT) if len(packed) >= self.body_at else (0, 0)
             yield packed, Caller(self.reader.sender(), header)

@@ -45,7 +45,7 @@ class RosParameters(PlaceParameters):
             at.check(getattr(self, at.option))
 
     def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
-        """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""
+        """Return the result of ``opened`` for a new node called ``name``; if it raises, the node leaves."""
         place = middleware_kind(self.middleware).place_in(self)
         node = open_middleware(self.middleware, domain_id=self.domain_id, node_name=name, place=place)
         try:

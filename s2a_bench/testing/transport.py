@@ -299,7 +299,7 @@ class TransportSuite:
         assert trace.facts["had_arrived"] == 1
 
     def test_inference_begins_when_the_engine_is_free(self, connect: Connect, wiring: Wiring[Any]) -> None:
-        """Not in the queue or before, by the marks and by what a policy server reports."""
+        """Inference begins neither in the queue nor before, by the marks and by what a policy server reports."""
         if wiring.black_box:
             pytest.skip("a black box sends no marks")
         recording, busy = self.handler(wiring, ["x", "y"]), Event()

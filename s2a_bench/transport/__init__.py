@@ -134,7 +134,7 @@ class Client(Protocol):
         """
 
     def describe(self) -> dict[str, str]:
-        """Return what the manifest records of the client beside its wiring."""
+        """Return the manifest's facts about the client beside its wiring."""
         return {}
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class Server(Protocol):
     """The address for clients of the same transport, known once the server exists."""
 
     def describe(self) -> dict[str, str | int]:
-        """Return what the manifest records of the server."""
+        """Return the manifest's facts about the server."""
 
     def serve(self) -> None:
         """Serve until `stop` is called from another thread or a signal handler."""
@@ -324,7 +324,7 @@ class Transport(Generic[O]):
         return False
 
     def against_loss(self, options: O) -> str:  # noqa: ARG002
-        """Return what to do where messages are lost."""
+        """Return the way out where messages are lost."""
         return "check the network"
 
     def addresses(self, options: O) -> Iterable[str]:  # noqa: ARG002

@@ -33,7 +33,7 @@ class Joined:
     """The bound from the last byte packed to the first piece, in both directions."""
     early_ns: int
     late_ns: int
-    """From the reception of the frame to the last piece: how much earlier and later the true times may be."""
+    """How much earlier and later the true times may be, from the reception of the frame to the last piece."""
 
 
 class OtherClock(Protocol):
@@ -58,7 +58,7 @@ class Around:
         return {}
 
     def server_side(self) -> AbstractContextManager[None]:
-        """Return what servers are started within."""
+        """Return the context within which servers are started."""
         return nullcontext()
 
     def origin(self, origin: Provenance) -> Provenance:
@@ -86,18 +86,18 @@ class Surroundings:
 
     @classmethod
     def of(cls, config: Any, pipelines: Sequence[Pipeline]) -> Surroundings | None:
-        """Return what a configuration, which has ``options``, asks for; None: nothing.
+        """Return the surroundings that a configuration, which has ``options``, asks for; None: none.
 
         Raises UsageError, naming the field, for what a pipeline cannot have.
         """
         raise NotImplementedError
 
     def around(self) -> AbstractContextManager[Around]:
-        """Return what the thread that makes the requests enters, before a source of pictures is opened."""
+        """Return the context that the thread of the requests enters, before a source of pictures is opened."""
         return nullcontext(Around())
 
     def clock(self, exchange: Exchange, shared: dict[str, Any] | None) -> OtherClock | None:
-        """Return what puts the reports of a session's server on this host's clock.
+        """Return the object that puts the reports of a session's server on this host's clock.
 
         ``shared`` is what the sessions of a launch keep together; None: no exchange may be made beside the requests.
         """

@@ -37,13 +37,13 @@ class Seen:
 
     what: str
     request_ns: int
-    """First byte of the request arrived."""
+    """The first byte of the request arrived."""
     sent_ns: int = 0
-    """Its last byte was passed on."""
+    """The last byte of the request was passed on."""
     answer_ns: int = 0
-    """First byte of the answer arrived."""
+    """The first byte of the answer arrived."""
     end_ns: int = 0
-    """Its last byte was passed on."""
+    """The last byte of the answer was passed on."""
     up_bytes: int = 0
     down_bytes: int = 0
     pieces_ns: list[int] = field(default_factory=list)
@@ -125,7 +125,7 @@ class TapReader:
         self.report(seen)
 
     def end(self) -> None:
-        """Tell of the requests that a connection ended without an answer to."""
+        """Report the requests that a connection ended without an answer to."""
         for seen in self._waiting:
             seen.error = seen.error or "the connection ended before the answer"
             self.report(seen)
@@ -195,7 +195,7 @@ class Incoming:
             yield
 
     def _joined(self) -> bytes:
-        """Join what is there, without a copy if it came together."""
+        """Join the bytes that are there, without a copy if they came together."""
         if len(self._pieces) > 1:
             first, *others = self._pieces
             self._pieces, self._at = [b"".join((memoryview(first)[self._at :], *others))], 0

@@ -24,7 +24,7 @@ TTC_POLICY: Final[Any] = option(False, "add s2a-ttc: stream-to-act that starts b
 
 
 class CcrbDrives(PolicyOptions):
-    """What is driven; the defaults are an operating point with the paper's outcome."""
+    """The drives; the defaults are an operating point with the paper's outcome."""
 
     PANEL: ClassVar[str] = "Drives"
     closed_loop: ClassVar[bool] = False

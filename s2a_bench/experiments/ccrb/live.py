@@ -61,7 +61,7 @@ class CcrbLivePlan:
 
 
 def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
-    """Decide what follows from a configuration, with the model's files; raises S2AError."""
+    """Derive the run plan from a configuration, with the model's files; raises S2AError."""
     scenario, tokens = config.scenario, config.tokens_per_skill
     prompts = PromptPlan([load_skills(config.skill_set)], [tokens], [scenario.skills])
     requests, (prompt,) = plan_requests(config.requests.but(seed=config.seed), prompts, progress)

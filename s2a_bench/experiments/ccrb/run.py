@@ -41,7 +41,7 @@ class CcrbPlan:
 
 
 def resolve(config: CcrbModelled) -> CcrbPlan:
-    """Decide what follows from a configuration; opens and starts nothing."""
+    """Derive the run plan from a configuration; opens and starts nothing."""
     scenario, board = config.scenario, config.board
     manifest = {
         "configuration": config.to_manifest(),

@@ -42,7 +42,7 @@ class LivePlan:
 
 
 def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
-    """Decide what follows from a configuration, with the model's files; raises S2AError."""
+    """Derive the run plan from a configuration, with the model's files; raises S2AError."""
     plans = prompt_plan(config)
     requests, prompts = plan_requests(config.requests.but(seed=config.seed), plans, progress)
     engine = {"engine": requests.engine.to_manifest()}

@@ -51,7 +51,7 @@ class ModelledPlan:
 
 
 def resolve(config: TimelineComputed) -> ModelledPlan:
-    """Decide what follows from a configuration; raises S2AError for recorded answers that are missing or too short."""
+    """Derive the run plan from a configuration; raises S2AError for recorded answers that are missing or too short."""
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),

@@ -1,4 +1,4 @@
-"""What policies learn: from a board's tokens before the first one, and from plan to plan in executed runs."""
+"""Learning of policies: from a board's tokens before the first plan, and from plan to plan in executed runs."""
 
 from __future__ import annotations
 

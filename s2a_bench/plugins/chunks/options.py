@@ -120,7 +120,7 @@ class ServedOptions(ControlOptions):
 
     @property
     def answer(self) -> str:
-        """What the server answers with."""
+        """The kind of the server's answers."""
         return ACTIONS
 
     @cached_property

@@ -219,7 +219,7 @@ class GymRobot(TaskRobot):
         self._env.close()
 
     def _at(self, key: str) -> Any:
-        """Return what the observation has at a key, PARENT.CHILD within another, or all of it."""
+        """Return the observation's value at a key, PARENT.CHILD within another, or all of it."""
         seen = self._seen
         for name in key.split(".") if key else ():
             if not isinstance(seen, dict) or name not in seen:

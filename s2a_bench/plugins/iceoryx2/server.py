@@ -182,7 +182,7 @@ class Iceoryx2Exchange(Exchange):
             self._active = None  # iceoryx2 lends a client's requests by number, and a logged error would hold this one
 
     def _flush(self) -> bool:
-        """Send what the client has room for; return whether anything is left. Raises Disconnected."""
+        """Send as much as the client has room for; return whether anything is left. Raises Disconnected."""
         if self.disconnected():
             raise Disconnected
         unsent = self._unsent

@@ -94,7 +94,7 @@ class Domain:
         return self._node.service_builder(iceoryx2.ServiceName.new(whole)).event()
 
     def clean(self) -> None:
-        """Remove what killed processes left; their events then have no listener."""
+        """Remove the leftovers of killed processes; their events then have no listener."""
         self._node.try_cleanup_dead_nodes()
 
     def leave(self) -> None:

@@ -118,7 +118,7 @@ class Unserved(CallbackGroup):  # type: ignore[misc]
     beginning_execution = can_execute
 
     def ending_execution(self, entity: Any) -> None:
-        """Nothing has begun."""
+        """Do nothing: no callback has begun."""
 
 
 class RclpyWaiter:

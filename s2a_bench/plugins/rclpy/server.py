@@ -191,7 +191,7 @@ class RclpyActionServer:
         self._server.destroy()
 
     def _serve(self) -> None:
-        """Take what comes until closed; a request that fails is reported and the next is served."""
+        """Take requests until closed; one that fails is reported and the next is served."""
         while not self._waiter.interrupted:
             try:
                 if self._waiter.wait_until(now_ns() + WAIT_SLICE_NS):

@@ -52,7 +52,7 @@ class Pairs:
             self._hold(message)
 
     def end(self) -> None:
-        """Tell of the last exchange."""
+        """Report the last exchange."""
         self._decide(self.paired or ORDER)
         self._close()
 

@@ -29,7 +29,7 @@ class TappedClient:
     number: int
     host: str
     wire: Wire | None = None
-    """Its connection; None between two."""
+    """The present connection; None between two."""
 
 
 @dataclass(slots=True)
@@ -157,7 +157,7 @@ class Passed:
         return part
 
     def read(self) -> None:
-        """Read what has been passed on, up to a part that has not been yet, which may be the request before it."""
+        """Read the parts that have been passed on, up to one that has not been yet, perhaps the request before them."""
         with self._lock:
             while self._parts and (self._parts[0].to_ns or len(self._parts) > MOST_HELD):
                 self._read(self._parts.popleft())

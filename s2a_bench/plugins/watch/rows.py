@@ -81,7 +81,7 @@ class Before:
 
 @dataclass(slots=True)
 class SeenCycles:
-    """Turns what was seen into rows, client by client."""
+    """Turns exchanges into rows, client by client."""
 
     tick_ns: float = 0.0
     """The tick of the robot's control loop; 0: unknown."""

@@ -60,7 +60,7 @@ def _values(value: Any) -> Iterator[tuple[str, int, int]]:
 
 
 def _array(array: NDArray[Any]) -> tuple[str, int, int]:
-    """Tell pictures, (..., H, W, 3) or (..., 3, H, W), from numbers."""
+    """Distinguish pictures, (..., H, W, 3) or (..., 3, H, W), from numbers."""
     if array.ndim >= 3 and array.shape[-3] == 3 != array.shape[-1]:  # noqa: PLR2004 - colours first
         array = np.moveaxis(array, -3, -1)
     if array.ndim < 3 or array.shape[-1] != 3 or min(array.shape[-3:-1]) < LEAST_SIDE:  # noqa: PLR2004

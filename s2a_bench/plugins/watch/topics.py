@@ -204,7 +204,7 @@ def _pairs(watch: Watch, names: tuple[str, str], topics: Iterable[Topic]) -> Pai
 
 
 def _finish(watch: Watch, pairs: Pairs, names: tuple[str, str]) -> Path:
-    """Write what is left and return the run folder; raises TransportError if no exchange was seen."""
+    """Write the last exchanges and return the run folder; raises TransportError if none was seen."""
     pairs.end()
     exchanges = watch.keep_rest()
     counts = {name: getattr(pairs, name) for name in ("paired", "observations", "answers", "unpaired")}

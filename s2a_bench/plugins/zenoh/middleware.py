@@ -84,7 +84,7 @@ class ZenohSubscription:
         self._seen = node.announce(names.SUBSCRIPTION, topic, type_name, version, qos)
 
     def _declared(self, key: str, qos: QoS) -> Any:
-        """Declare what fills the inbox; of a latched topic also with what its publishers keep."""
+        """Declare the subscriber that fills the inbox; of a latched topic also with the samples its publishers keep."""
         held = ref(self._inbox)  # Zenoh keeps the callback for as long as the session lives
 
         def put(sample: Any) -> None:
@@ -168,7 +168,7 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
         self._seen = node.announce(names.SERVICE, spec.name, spec.type_name, spec.version, qos)
 
     def arrived(self) -> Iterator[tuple[memoryview, QueryOrigin]]:
-        """Take what has arrived, a bounded number; drop queries that are not rmw_zenoh's and log the first."""
+        """Take the queries that have arrived, a bounded number; drop those not of rmw_zenoh and log the first."""
         for query in self._inbox.arrived():
             payload, attachment = query.payload, query.attachment
             try:

@@ -36,7 +36,7 @@ RECEIVE_BYTES: Final = 1 << 20
 BATCHES: Final = 16
 """Batches of 64 KiB in the send queue, by default 2: with 16, sending a picture of 640x480 does not block."""
 OPEN_MS: Final = 5000
-"""So long a router may take to say what it is."""
+"""The longest time that a router may take to say what it is."""
 SEND_US: Final = 5_000_000
 """A peer that reads nothing for so long is hung up on."""
 HELD_BYTES: Final = 256 << 20

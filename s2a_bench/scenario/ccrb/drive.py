@@ -161,7 +161,7 @@ class Drive(LockStep):
         return self._outcomes
 
     def trajectory(self) -> Trajectory | None:
-        """Return what was recorded, None without a step of it."""
+        """Return the recorded trajectory, None without a step of it."""
         if not self._records:
             return None
         times_s, states, accelerations, phases, skills = zip(*self._records, strict=True)

@@ -225,7 +225,7 @@ class HttpClient(Client):
 
 
 def _beginning(body: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield what arrives of a refusal, up to `QUOTED_BYTES`; one that does not end is quoted all the same."""
+    """Yield the beginning of a refusal, up to `QUOTED_BYTES`; one that does not end is quoted all the same."""
     size = 0
     with suppress(RequestFailed, httpx.TimeoutException):
         while size < QUOTED_BYTES and (piece := next(body, b"")):

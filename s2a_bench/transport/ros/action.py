@@ -269,7 +269,7 @@ class GoalExchange(RosExchange):
         return not any(stop in text for stop in self._stop)
 
     def _feed(self) -> None:
-        """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
+        """Send the held tokens as one feedback: one, or several that came faster than ROS clients' queues hold."""
         if self._held:
             self._goal.feedback(llama.token_feedback("".join(self._held), self._tokens[-1].id, self._source.version))
             self._held.clear()

@@ -202,7 +202,7 @@ class CameraCache:
         return self._newest
 
     def silence(self) -> str:
-        """Return what to look at where no frame comes although the topics have publishers; "" where they have none."""
+        """Return the places to look at if no frame comes although the topics have publishers; "" if they have none."""
         counts = self._publishers().items()
         present = ", ".join(f"{count} publisher{'s' if count > 1 else ''} on {topic}" for topic, count in counts)
         if not present:

@@ -125,7 +125,7 @@ class RosClient(Client):
             raise
 
     def _meet_server(self, namespace: str) -> None:
-        """Make what the client needs and wait until the server has matched it; raises TransportError."""
+        """Make the client's endpoints and wait until the server has matched them; raises TransportError."""
         raise NotImplementedError
 
     @cached_property
@@ -151,7 +151,7 @@ class RosClient(Client):
             )
 
     def taken(self, take: Callable[[float], T | None], bounds: Bounds) -> Iterator[T | None]:
-        """Yield what comes, None where nothing came for a moment, until the longest silence is over."""
+        """Yield messages as they come, None if none came for a moment, until the longest silence is over."""
         deadline_ns = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline_ns:
             yield take(min(POLL_S, bounds.left_s()))

@@ -60,7 +60,7 @@ class FleetPlan:
     wiring: Mapping[str, Any]
     """The result of `Wiring.to_json`."""
     requests: RunPlan
-    """Without its cells."""
+    """The run plan, without its cells."""
     load: RobotLoad
     first: int = 0
     """Place in the run before those of its requests."""
@@ -256,7 +256,7 @@ class Fleet:
         return ChunkRobot(load.mode, load, session, blocks, phase_ns, self._done)
 
     def traces(self, start_ns: int) -> list[RobotTrace]:
-        """Return what each robot did so far, as if it had started at ``start_ns``; raises what ended one."""
+        """Return the traces of the robots so far, as if started at ``start_ns``; raises the error that ended one."""
         end_ns, by_ns = now_ns(), start_ns - self._start_ns
         return [robot.trace(number, end_ns).shifted(by_ns) for number, robot in self._robots.items()]
 
@@ -374,7 +374,7 @@ class FleetOnRay(RemoteFleet):
         self._fleet = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(Fleet).remote(plan)
 
     def machine(self) -> dict[str, Any]:
-        """Return what the process runs on; raises UsageError if no core of the cluster comes free."""
+        """Return the facts of the process's machine; raises UsageError if no core of the cluster comes free."""
         reply = self._fleet.machine.remote()
         if not self._ray.wait([reply], timeout=FREE_CORE_S)[0]:
             raise UsageError(f"`processes`: no core of the cluster came free within {FREE_CORE_S:g} s; take fewer")

@@ -48,7 +48,7 @@ class Service:
     recorded_ns: Ints | None
     mean_ns: float
     servers: int = 1
-    """They share one queue."""
+    """The number of servers, which share one queue."""
     slower: Sequence[float] = (1.0,)
     """The factors of `simulate.serve`."""
 

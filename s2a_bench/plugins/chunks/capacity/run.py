@@ -136,7 +136,7 @@ class _Cell:
             self._conclude()
 
     def _predict(self) -> None:
-        """Write what one robot's service times predict of the fleets."""
+        """Write the prediction of the fleets from one robot's service times."""
         if self.service is None:
             return
         name, progress = self.load.of(self.session.cell.name), self.launch.progress

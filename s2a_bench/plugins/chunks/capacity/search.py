@@ -62,7 +62,7 @@ def search(numbers: Sequence[int], attempt: Callable[[int], Tried], tried: dict[
 
 
 def knee(tried: Iterable[Tried]) -> Knee | None:
-    """Return what fleets show together, taking a larger fleet to fare no better; None without a measurement."""
+    """Return the knee of fleets, taking a larger fleet to fare no better; None without a measurement."""
     clean = [each for each in tried if each.clean]
     if not clean:
         return None

@@ -79,7 +79,7 @@ class LiveResult:
         }
 
     def actions(self) -> ActedCell:
-        """Return what the cell did, with the latencies of complete answers, to their first action.
+        """Return the actions of the cell, with the latencies of complete answers, to their first action.
 
         Raises TransportError for fewer than two chunks.
         """

@@ -140,7 +140,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Yield what holds for every server of lerobot's; no method is called, as `Ready` would reset it."""
+    """Yield the findings that hold for every server of lerobot's; no method is called, as `Ready` would reset it."""
     yield from connect(parts)
     what = "lerobot's policy server answers no sooner than 33 ms after a request, unless it was started otherwise"
     yield Finding("sleep", "advice", what, "start it with --inference_latency=0; runs warn of it (padded-answers)")

@@ -99,7 +99,7 @@ def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any
 
 
 def _names() -> Names:
-    """Return what the names of one answer stand for, made for it alone: a pickle can set their attributes."""
+    """Return the meaning of an answer's names, made anew for each answer: a pickle can set their attributes."""
     storages: dict[bytes, Numbers] = {}
 
     class TimedAction(SimpleNamespace):

@@ -132,7 +132,7 @@ class GrpcReader(ParsedTapReader):
             self.report(call.seen)
 
     def _got(self, call: SeenCall) -> None:
-        """Tell of an observation with its chunk, or the error in place of one."""
+        """Report an observation with its chunk, or the error in place of one."""
         its = [each for each in self._observations if each.whole][-1:]
         with suppress(RequestFailed):
             stamp, actions = chunk_in(bytes_in(call.chunk))

@@ -72,7 +72,7 @@ def actions_in(answer: Any) -> list[Action]:
 
 
 def modalities(layout: str) -> dict[str, Any]:
-    """Return what ``get_modality_config`` tells of our server; `AUTO` has the marks of N1.6 and of N1.7."""
+    """Return our server's answer to ``get_modality_config``; `AUTO` has the marks of N1.6 and of N1.7."""
     configs: dict[str, Any] = {}
     marks = CONFIG_MARKS.values() if layout == AUTO else [CONFIG_MARKS.get(layout, CONFIG_MARKS[N1_6])]
     for modality, name in NAMES.items():

@@ -117,7 +117,7 @@ class ZmqServer:
         return self._taken(frames, trace)
 
     def _taken(self, frames: list[Any], trace: Trace) -> Callable[[], None] | None:
-        """Return what answers a message: its last frame, behind the envelope that goes back with the reply."""
+        """Return the job that answers a message: its last frame, behind the envelope that goes back with the reply."""
         send = partial(self._reply, [frame.bytes for frame in frames[:-1]])
         with ExitStack() as held:
             try:

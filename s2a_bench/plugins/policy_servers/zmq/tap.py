@@ -1,4 +1,4 @@
-"""Reads what passes between a client and a server of GR00T's protocol: ZMTP 3 (ZeroMQ's RFC 23) and MessagePack.
+"""Reads the messages of a client and a server of GR00T's protocol: ZMTP 3 (ZeroMQ's RFC 23) and MessagePack.
 
 A message of several frames is one request or answer: the last one is the body, those before it are its envelope. Of a
 request only the head is read, for its endpoint, unless it is the first of its kind.

@@ -1,4 +1,4 @@
-"""Which transport for a link: the fitted lines of a sweep of transports, plus what the link takes.
+"""Predict each transport over a link: the fitted lines of a sweep of transports, plus the time that the link takes.
 
 The sweep ran without a link, on one machine: its lines hold the work of both ends. The link adds its delays, and the
 time in which its rate carries the bytes that the pipeline sends. Both are the median's; losses are not predicted.
@@ -90,7 +90,7 @@ class Advice:
 
     @property
     def inside(self) -> bool | None:
-        """Whether what was measured lies in the interval; None without either."""
+        """Whether the measured value lies in the interval; None without either."""
         if self.measured_ms is None or self.ends_ms is None:
             return None
         return self.ends_ms[0] <= self.measured_ms <= self.ends_ms[1]

@@ -68,7 +68,7 @@ class EmulatedLink(Around):
         return replace(origin, link="emulated", link_profile=self.profile.about)
 
     def totals(self) -> dict[str, Any]:
-        """Return what the relay carried and lost, and how late it was."""
+        """Return the relay's counts of packets carried and lost, and how late it was."""
         return {"link": {"relay": self._relay.ask()}}
 
 
