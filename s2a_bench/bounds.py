@@ -24,5 +24,4 @@ Fraction = Annotated[float, Facts(minimum=0, maximum=1)]
 
 
 def about(description: str) -> Facts:
-    """Return an annotation that describes a field."""
     return Facts(description=description)

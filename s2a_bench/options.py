@@ -20,7 +20,7 @@ from pydantic_core import ErrorDetails
 from s2a_bench.errors import UsageError
 from s2a_bench.text import like, none_of, read_text
 
-Made = TypeVar("Made", bound="Options")
+SomeOptions = TypeVar("SomeOptions", bound="Options")
 
 
 class Options(BaseModel):
@@ -33,10 +33,10 @@ class Options(BaseModel):
     virtual: ClassVar[bool] = False
     """Whether a run computes in virtual time, so that several may share a machine; measuring runs may not."""
 
-    def __init__(self, **given: Any) -> None:
+    def __init__(self, **values: Any) -> None:
         """Raise UsageError, naming the field, for an invalid value."""
         try:
-            super().__init__(**given)
+            super().__init__(**values)
         except ValidationError as error:
             raise UsageError(_line(error.errors()[0], type(self))) from None
 
@@ -46,7 +46,7 @@ class Options(BaseModel):
     def check(self) -> None:
         """Raise UsageError, naming the fields, for values that contradict each other."""
 
-    def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
+    def but(self: SomeOptions, **changes: Any) -> SomeOptions:  # noqa: PYI019 - typing has Self since Python 3.11
         """Return a copy with some fields changed, checked like a new one."""
         return type(self)(**self.given_values() | changes)
 
@@ -149,24 +149,24 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
                 new = [(name, *path) for path in paths if not only or path[0] in only]
                 if not new:
                     continue
-                known = paths_of.setdefault(each, new)
-                if known is not new and beside(known[0], new[0]):
-                    known += new
+                paths_so_far = paths_of.setdefault(each, new)
+                if paths_so_far is not new and beside(paths_so_far[0], new[0]):
+                    paths_so_far += new
     for name, field in options.model_fields.items():
         if group_of(field) is None:
             paths_of |= {name: [(name,)], str(extra_of(field).get("flag") or name).replace("-", "_"): [(name,)]}
     return paths_of
 
 
-def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
+def placed(options: type[Options], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return options, each given by one of its names, as arguments of the class; unknown names stay."""
-    known = places(options)
+    paths = places(options)
 
     def at(name: str, value: Any) -> list[Place]:
         whole = name in options.model_fields and isinstance(value, (Options, dict))
-        return [(name,)] if whole else known.get(name, [(name,)])
+        return [(name,)] if whole else paths.get(name, [(name,)])
 
-    return nested((path, value) for name, value in given.items() for path in at(name, value))
+    return nested((path, value) for name, value in values.items() for path in at(name, value))
 
 
 def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
@@ -183,7 +183,8 @@ def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
 def _line(error: ErrorDetails, options: type[Options]) -> str:
     field = str(error["loc"][0]) if error["loc"] else ""
     if error["type"] == "extra_forbidden":
-        return f"`{field}` is none of the options {', '.join(options.model_fields)}{like(field, options.model_fields)}"
+        names = options.model_fields
+        return f"`{field}` is not one of the options {', '.join(names)}{like(field, names)}"
     if error["type"] == "missing":
         return f"`{field}` is needed"
     if error["type"] == "too_short":
@@ -195,9 +196,9 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
 
 
 def need_program(field: str, path: Path) -> None:
-    """Raise UsageError if the path of a field is no program that can be run."""
+    """Raise UsageError if the path of a field is not an executable program."""
     if not (path.is_file() and os.access(path, os.X_OK)):
-        raise UsageError(f"`{field}`: {path} is no program that can be run")
+        raise UsageError(f"`{field}`: {path} is not an executable program")
 
 
 def listed(value: Any) -> tuple[Any, ...]:
@@ -216,8 +217,8 @@ def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
 
 def _one_of(names: Callable[[], Iterable[str]], value: Any) -> Any:
     for each in value if isinstance(value, tuple) else (value,):
-        if each not in (known := tuple(names())):
-            raise ValueError(none_of(each, known))
+        if each not in (allowed := tuple(names())):
+            raise ValueError(none_of(each, allowed))
     return value
 
 

@@ -17,7 +17,7 @@ NOT_SENT: Final = "not seen or sent"
 ORIGIN: Final = "Provenance: "
 AT_TAP, AT_TOPICS, RECORDED = "seen at the tap", "seen at the topics", "recorded"
 SEEN: Final = (AT_TAP, AT_TOPICS, RECORDED)
-"""Where tokens of a robot of others were seen, neither by its client nor by its server."""
+"""Observers of another robot's tokens that are neither its client nor its server."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",
@@ -90,7 +90,7 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
-        """Read the entry of a manifest or a peer; a field that is missing or no text has its default."""
+        """Read the entry of a manifest or a peer; a field that is missing or not text has its default."""
         return cls(**{name: _text(value) for name in _FIELDS if isinstance(value := values.get(name), str) and value})
 
     def to_dict(self) -> dict[str, str]:
@@ -103,7 +103,7 @@ class Provenance:
 
     @property
     def over(self) -> str:
-        """Return what a cell's name lacks of an emulated link: " over 4g"; else empty."""
+        """Return an emulated link as an addition to a cell's name, " over 4g"; else empty."""
         name = self.link_profile.partition(" (")[0]
         return f" over {name}" if name else ""
 

@@ -41,8 +41,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
         Of two with one name it is that of s2a-bench, else the first by module, wherever they are installed.
         """
-        known = installed_points().select(group=self.group)
-        points = sorted(known, key=lambda each: (not each.value.startswith(OURS), each.value))
+        offered = installed_points().select(group=self.group)
+        points = sorted(offered, key=lambda each: (not each.value.startswith(OURS), each.value))
         by_name = {point.name: point for point in reversed(points)}
         return {name: point for name, point in sorted(by_name.items()) if name not in self._builtins}
 

@@ -53,4 +53,4 @@ def like(name: str, names: Iterable[str]) -> str:
 
 def none_of(name: str, names: Collection[str], more: str = "") -> str:
     """Return the error about an unknown name: the known ones, ``more``, and the closest."""
-    return f"'{name}' is none of {', '.join(filter(None, names))}{more}{like(name, names)}"
+    return f"'{name}' is not one of {', '.join(filter(None, names))}{more}{like(name, names)}"

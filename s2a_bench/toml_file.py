@@ -60,20 +60,20 @@ def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
     """Return the text of a file that an ``option`` names; raises UsageError."""
     try:
         return read_text(path, most)
-    except (OSError, ValueError) as error:  # it is no UTF-8, or its name has a NUL
+    except (OSError, ValueError) as error:  # it is not UTF-8, or its name has a NUL
         raise UsageError(f"`{option}`: cannot read {path}: {error}") from error
 
 
 def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:
     """Read TOML text; ``where`` begins every error. Raises UsageError."""
     if _DEEP.search(text):
-        raise UsageError(f"{where}: no TOML that can be read: it has a dotted key of more than 32 names")
+        raise UsageError(f"{where}: not TOML that can be read: it has a dotted key of more than 32 names")
     try:
         return tomllib.loads(text, parse_float=parse_float)
     except RecursionError:
-        raise UsageError(f"{where}: no TOML that can be read: its arrays or tables are too deep") from None
+        raise UsageError(f"{where}: not TOML that can be read: its arrays or tables are too deep") from None
     except ValueError as error:  # a TOMLDecodeError, or a whole number of thousands of digits
-        raise UsageError(f"{where}: no TOML: {error}") from error
+        raise UsageError(f"{where}: not TOML: {error}") from error
 
 
 def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], Any] = float) -> T:
@@ -82,7 +82,7 @@ def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], An
 
 
 def checked(table: type[T], content: Any, where: str) -> T:
-    """Return what was read of TOML or JSON as a table; raises UsageError as `parse` does."""
+    """Return values read from TOML or JSON as a table; raises UsageError as `parse` does."""
     try:
         return table.model_validate(content)
     except ValidationError as error:
@@ -118,8 +118,8 @@ def _path(steps: Iterable[int | str], content: Any) -> str:
     """Write a key after its tables; an element of an array appears with its ``name``, if it has one."""
     path = ""
     for step in steps:
-        known = (isinstance(content, Mapping) and step in content) or isinstance(step, int)
-        content = content[step] if known else None
+        has_step = (isinstance(content, Mapping) and step in content) or isinstance(step, int)
+        content = content[step] if has_step else None
         if isinstance(step, int):
             name = content.get("name") if isinstance(content, Mapping) else None
             path += f"[{name if isinstance(name, str) and name.isidentifier() else step}]"

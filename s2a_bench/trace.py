@@ -96,7 +96,7 @@ class Remote:
 
     @staticmethod
     def of_json(value: Mapping[str, Any]) -> Remote:
-        """Read a server's JSON; raises ValueError, KeyError or TypeError if it is no report."""
+        """Read a server's JSON; raises ValueError, KeyError or TypeError if it is malformed."""
         return Remote(
             clock=value["clock"],
             marks=[(stage, stamp) for stage, stamp in value["marks"]],
@@ -124,10 +124,10 @@ class Remote:
         """Return the report; raises ValueError if its values, which come from outside, are impossible."""
         marks = [*self.marks, *self.frame_marks]
         if not all(isinstance(text, str) for text in (self.clock, *(stage for stage, _ in marks))):
-            raise ValueError("marks whose stages are no text")
+            raise ValueError("marks whose stages are not text")
         for stamp in (*self.token_ns, *(stamp for _, stamp in marks), max(self.frame_stamp_ns, 0)):
             if type(stamp) is not int or stamp not in STAMPS:
-                raise ValueError("marks whose times are none")
+                raise ValueError("marks whose times are invalid")
         if not isinstance(self.facts, Mapping):
             raise ValueError("facts without names")  # noqa: TRY004 - one type of error for data from outside
         if not isinstance(self.provenance, Mapping):
@@ -166,7 +166,7 @@ class Trace:
         """Keep a server's facts; an impossible value (NaN, 1e300, text) stays absent and is ``odd``."""
         for name, value in facts.items():
             if not (isinstance(name, str) and name.isidentifier() and len(name) < NAME_LIMIT):
-                self.odd.add("a name that is none")
+                self.odd.add("an invalid name")
             elif type(value) in {int, float} and abs(value) <= FACT_LIMIT:
                 self.facts[name] = value
             else:
@@ -207,8 +207,8 @@ class Budget:
     @property
     def e2e_without_model_ns(self) -> int | None:
         """Return e2e minus the model's time, or None if the engine does not report its preprocessing."""
-        known = {"preprocess", "inference"} <= self.stages_ns.keys()
-        return self.e2e_ns - self.stages_ns["inference"] if known else None
+        reported = {"preprocess", "inference"} <= self.stages_ns.keys()
+        return self.e2e_ns - self.stages_ns["inference"] if reported else None
 
     @property
     def residual_share(self) -> float | None:

@@ -50,7 +50,7 @@ def _numbers(what: str, values: Any, dimensions: tuple[int, ...]) -> Vector:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:
-        raise RequestFailed(f"{what}: no array of numbers: {error}") from error
+        raise RequestFailed(f"{what}: not an array of numbers: {error}") from error
     if array.ndim == BATCHED and len(array) == 1:
         array = array[0]
     if array.ndim not in dimensions or not array.size or array.dtype.kind not in "fiu":
@@ -58,7 +58,7 @@ def _numbers(what: str, values: Any, dimensions: tuple[int, ...]) -> Vector:
         raise RequestFailed(f"{what}: shape {array.shape} and type {array.dtype}, not numbers of shape {shape}")
     if array.size > NUMBERS:
         raise RequestFailed(f"{what}: {array.size} numbers; at most {NUMBERS} are taken")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is refused below
         vector = array.astype(np.float32)
     if not np.isfinite(vector).all():
         raise RequestFailed(f"{what}: not finite numbers")

@@ -82,9 +82,9 @@ def test_samples_leave_warm_ups_out_and_runs_are_compared(tmp_path: Path) -> Non
 def test_a_field_is_named_in_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"^`points`: 1 should be greater than or equal to 2$"):
         s2a.boundary(points=1, output=tmp_path)
-    with pytest.raises(UsageError, match=r"^`runs` is none of the options transports"):
+    with pytest.raises(UsageError, match=r"^`runs` is not one of the options transports"):
         s2a.latency(runs=50)
-    with pytest.raises(UsageError, match=r"^`speed` is none of the options profiles"):
+    with pytest.raises(UsageError, match=r"^`speed` is not one of the options profiles"):
         s2a.boundary(speed=1, output=tmp_path)
 
 

@@ -42,7 +42,7 @@ def test_an_unknown_name_is_one_line_that_names_the_field_and_the_choice(registr
     assert "nothing" not in registry
     with pytest.raises(UsageError) as caught:
         registry["nothing"]
-    assert str(caught.value).startswith("`the_thing`: 'nothing' is none of join, broken, tail")
+    assert str(caught.value).startswith("`the_thing`: 'nothing' is not one of join, broken, tail")
     assert with_flags(str(caught.value)).startswith("--the-thing: 'nothing'")
 
 

@@ -103,7 +103,7 @@ def test_what_a_server_says_of_itself_is_a_number_that_floats_count_exactly_or_o
     trace.learn({"more": 2**53 + 1, "less": -(2**53) - 1, "nan": math.nan, "inf": math.inf, "yes": True, "text": "1"})
     assert trace.odd == {"more", "less", "nan", "inf", "yes", "text"}
     trace.learn({"n" * 64: 1, "a b": 1, 5: 1})  # type: ignore[dict-item]
-    assert trace.odd == {"more", "less", "nan", "inf", "yes", "text", "a name that is none"}
+    assert trace.odd == {"more", "less", "nan", "inf", "yes", "text", "an invalid name"}
     assert len(trace.facts) == 4
 
 
@@ -113,14 +113,14 @@ REMOTE = Remote("clock", [("network", 2**62 - 1)], [0], -1, [("queue", 0)], {}, 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"clock": 5}, "stages are no text"),
-        ({"marks": [(5, 1)]}, "stages are no text"),
-        ({"frame_marks": [(None, 1)]}, "stages are no text"),
-        ({"marks": [("network", 2**62)]}, "times are none"),
-        ({"frame_marks": [("queue", -1)]}, "times are none"),
-        ({"token_ns": [1.0]}, "times are none"),
-        ({"token_ns": [True]}, "times are none"),
-        ({"frame_stamp_ns": 2**62}, "times are none"),
+        ({"clock": 5}, "stages are not text"),
+        ({"marks": [(5, 1)]}, "stages are not text"),
+        ({"frame_marks": [(None, 1)]}, "stages are not text"),
+        ({"marks": [("network", 2**62)]}, "times are invalid"),
+        ({"frame_marks": [("queue", -1)]}, "times are invalid"),
+        ({"token_ns": [1.0]}, "times are invalid"),
+        ({"token_ns": [True]}, "times are invalid"),
+        ({"frame_stamp_ns": 2**62}, "times are invalid"),
         ({"facts": []}, "facts without names"),
         ({"provenance": "llama"}, "a provenance without names"),
     ],

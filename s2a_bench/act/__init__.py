@@ -72,7 +72,7 @@ class ActionRobot(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How an episode went: in s, and in the units of its actions or of the position that is followed."""
+    """The result of an episode, in s and in the units of its actions or of the tracked position."""
 
     success: bool
     reward: float

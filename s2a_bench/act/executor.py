@@ -7,8 +7,8 @@ Rules of this file:
   missing it is *extended* up to the policy's ``latest_s``; when the next arrives meanwhile it is *compressed* to now.
 - After a skill that ends before its commanded end the next starts at once: waiting would only move idle time (T1).
 - While no skill runs the robot *holds* with the gap behaviour of the last skill, that of the set before the first.
-- If the stream breaks (error, silence, a line that is no skill) before all announced skills have arrived, the running
-  skill ends, no other is started, and the robot holds. After the last announced skill the stream is ignored.
+- If the stream breaks (error, silence, an invalid line) before all announced skills have arrived, the running skill
+  ends, no other is started, and the robot holds. After the last announced skill the stream is ignored.
 - A skill that fails or overruns its end by more than the patience ends the plan the same way; abort ends it at once.
 """
 
@@ -131,7 +131,7 @@ class Executor:
             self._fail("skill-failed", f"{self.record.skills[index].call}: {error}")
 
     def _act(self, due_ns: int) -> int | None:
-        """Do all that is due since ``due_ns``; return when to act again, None at the end."""
+        """Act on everything that is due since ``due_ns``; return when to act again, None at the end."""
         record = self.record
         while record.outcome is None:
             now_ns = self._clock.now_ns()
@@ -158,6 +158,7 @@ class Executor:
             return 0
         self._hold(now_ns)
         if requested_ns is not None and answer < math.inf:
+            # later than now: a time that rounding leaves in the past would be decided again for ever
             return max(requested_ns + math.ceil(answer * 1e9), now_ns + 1)
         return NEVER if self._open else self._settle(now_ns, "short", f"{started} of {self._announced} skills arrived")
 

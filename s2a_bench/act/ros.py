@@ -152,7 +152,7 @@ class RosSkills:
             duration_most=times.most_s,
         )
         packed = self._client.pack(goal)
-        with self._lock:
+        with self._lock:  # the result may be there before its report is
             goal_id = self._client.send(packed)
             self._reports[goal_id] = report
         return _Goal(self._client, goal_id)

@@ -78,7 +78,7 @@ def fit_markov(rows: Rows) -> Markov:
     pause = np.zeros_like(logs)
     for _ in range(_EM_STEPS):
         odds = np.log((1 - share) / share) + ((logs - high) ** 2 - (logs - low) ** 2) / (2 * variance)
-        pause = 1 / (1 + np.exp(np.clip(odds, -500, 500)))
+        pause = 1 / (1 + np.exp(np.clip(odds, -500, 500)))  # exp overflows above 709
         share = float(np.clip(pause.mean(), 1e-6, 1 - 1e-6))
         low = np.average(logs, weights=1 - pause + 1e-12)
         high = np.average(logs, weights=pause + 1e-12)
@@ -132,11 +132,11 @@ def _distances(gaps: Gaps, rows: Rows) -> tuple[float, float]:
     """Return the distance of single gaps and that of sums over a skill, 0 if no request is that long."""
     from scipy.stats import ks_2samp
 
-    drawn = gaps.sample(np.random.default_rng(0), SKILL_TOKENS, _DRAWS)
+    gaps_s = gaps.sample(np.random.default_rng(0), SKILL_TOKENS, _DRAWS)
     starts = range(0, max(map(len, rows)) - SKILL_TOKENS + 1, SKILL_TOKENS)
     sums = [sum(row[at : at + SKILL_TOKENS]) for row in rows for at in starts if at + SKILL_TOKENS <= len(row)]
-    single = float(ks_2samp(_flat(rows), drawn[0]).statistic)
-    return single, float(ks_2samp(sums, drawn.sum(axis=0)).statistic) if sums else 0.0
+    single = float(ks_2samp(_flat(rows), gaps_s[0]).statistic)
+    return single, float(ks_2samp(sums, gaps_s.sum(axis=0)).statistic) if sums else 0.0
 
 
 def _flat(rows: Rows) -> Floats:

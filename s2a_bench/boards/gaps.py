@@ -72,7 +72,7 @@ class Markov:
 
     mean_s: Mean
     cv: Number
-    """Within a state."""
+    """The coefficient of variation within a state."""
     pause_share: Annotated[float, Field(ge=0, le=0.999)]
     """Share of the tokens whose gap is a pause."""
     pause_ratio: Number
@@ -93,10 +93,10 @@ class Markov:
 
         shape = (tokens, plans)
         redraws = rng.random(shape, np.float32) < 1 / (self.pause_tokens * (1 - self.pause_share))
-        drawn = rng.random(shape, np.float32) < self.pause_share
+        paused = rng.random(shape, np.float32) < self.pause_share
         rows = np.arange(tokens, dtype=np.int32)[:, None]
         last = np.maximum.accumulate(np.where(redraws, rows, np.int32(0)), axis=0)  # the first row counts as drawn
-        pauses = np.take_along_axis(drawn, last, axis=0)
+        pauses = np.take_along_axis(paused, last, axis=0)
         gaps = _lognormal(rng, self.normal_s, self.cv, shape)
         gaps[pauses] *= self.pause_ratio
         return gaps
@@ -111,7 +111,7 @@ class Bursty:
 
     mean_s: Mean
     cv: Number
-    """Of the long gaps, and of the short ones."""
+    """The coefficient of variation of the long gaps, and of the short ones."""
     burst_tokens: Annotated[int, Field(ge=1)]
     within: Annotated[float, Field(ge=0, le=1)]
     """Mean gap inside a burst / mean of all gaps."""
@@ -209,7 +209,7 @@ def from_table(table: Mapping[str, Any], mean_s: float, where: str = "") -> Gaps
     """
     name = table.get("family")
     if not isinstance(name, str) or name not in FAMILIES:
-        raise UsageError(f"{where}family: {name!r} is none of {', '.join(FAMILIES)}")
+        raise UsageError(f"{where}family: {name!r} is not one of {', '.join(FAMILIES)}")
     family = FAMILIES[name]
     keys = [field.name for field in fields(family) if field.name != "mean_s"]
     values = {key: value for key, value in table.items() if key != "family"}

@@ -28,7 +28,7 @@ EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
 UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
 LONGEST_MS: Final = 3_600_000.0
 SEED: Final = 0
-"""Of every sequence of latencies, so that the option determines all of them."""
+"""The seed of every sequence of latencies, so that the option determines all of them."""
 STRETCH: Final = 65_536
 """Latencies that are drawn together."""
 
@@ -72,8 +72,8 @@ def family(written: str) -> Gaps:
     table = read_family(written, "latency")
     name = table["family"]
     mean_ms = table.pop("mean_ms", None)
-    if name not in (known := (*FAMILIES, "bimodal")):
-        raise UsageError(f"`latency`: '{name}' is none of the families {', '.join(known)}{like(str(name), known)}")
+    if name not in (names := (*FAMILIES, "bimodal")):
+        raise UsageError(f"`latency`: '{name}' is not one of the families {', '.join(names)}{like(str(name), names)}")
     if not isinstance(mean_ms, int | float) or not 0 < mean_ms <= LONGEST_MS:
         raise UsageError(f"`latency`: {written}: mean_ms should be above 0 and at most {LONGEST_MS:g}, as in {EXAMPLE}")
     if name == "bimodal":
@@ -113,7 +113,7 @@ def _latency(row: Mapping[str, str], latency_of: Callable[[Mapping[str, str]], f
     try:
         latency_ns = latency_of(row)
     except (TypeError, ValueError):
-        raise UsageError(f"{where}: the latency is no number") from None
+        raise UsageError(f"{where}: the latency is not a number") from None
     if not (math.isfinite(latency_ns) and 0 <= latency_ns <= LONGEST_MS * 1e6):
         raise UsageError(f"{where}: a latency of {latency_ns:g} ns should be between 0 and an hour")
     return round(latency_ns)

@@ -45,7 +45,7 @@ class Profile:
     origin: Literal["paper", "measured"]
     tokens_per_s: float
     prompt_s: float
-    """From the request to the start of decoding: ingest, vision tower and prompt."""
+    """Time from the request to the start of decoding: ingest, vision tower and prompt."""
     prompt_cv: float
     gaps: Gaps
     """The parametric form of the gaps; its mean is 1 / tokens_per_s."""
@@ -153,8 +153,8 @@ def to_toml(document: Mapping[str, Any]) -> str:
 
 
 def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
-    given = {key: value for key, value in table.items() if value is not None}
-    return {key: _without_none(value) if isinstance(value, Mapping) else value for key, value in given.items()}
+    values = {key: value for key, value in table.items() if value is not None}
+    return {key: _without_none(value) if isinstance(value, Mapping) else value for key, value in values.items()}
 
 
 def search_path() -> list[Path]:

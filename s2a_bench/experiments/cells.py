@@ -99,7 +99,7 @@ class Column:
 
     @property
     def key(self) -> str:
-        """Its key in ``--json``; empty if that lacks it."""
+        """Its key in ``--json``; empty for a column without one."""
         if self.json_key:
             return self.json_key.name
         return self.metric.name if self.metric and not self.as_stored else self.name
@@ -112,7 +112,6 @@ class Column:
 
 @cache
 def columns_of(row: type) -> tuple[Column, ...]:
-    """Return the columns that a dataclass of rows declares."""
     hints, as_stored = get_type_hints(row, include_extras=True), getattr(row, "as_stored", False)
     columns = []
     for name, kind in kinds_of(row).items():
@@ -221,7 +220,7 @@ class Cells(Generic[Row]):
         return TextTable(title, ("cell", "n", *titles), rows, 1, notes=tuple(notes))
 
     def subjects(self, setting: Sequence[str] = (), *, exact: bool = False) -> list[Subject]:
-        """Return what is compared, a subject a cell; the columns of ``setting`` must be equal on both sides."""
+        """Return the subjects to compare, one a cell; the columns of ``setting`` must be equal on both sides."""
         subjects = []
         for name, cell in self.split().items():
             shared = {column: str(getattr(cell.first, column)) for column in setting}
@@ -274,5 +273,5 @@ class Comparable:
 
     @classmethod
     def of(cls, table: Table[Any], shown: tuple[str, ...], setting: Sequence[str] = ()) -> Self:
-        """Return what compares the rows of a table, cell by cell."""
+        """Return the comparison of the rows of a table, cell by cell."""
         return cls(metrics_of(table.row), lambda run: Cells.of(run, table).subjects(setting), shown)

@@ -32,9 +32,9 @@ class Reference:
     """The declaration of one reference; what it names as ``module:attribute`` is imported when it is needed."""
 
     title: str
-    """What sentences call it, as "the paper"."""
+    """Its name in sentences, such as "the paper"."""
     source: str
-    """What it is in full, as "the Stream-to-Act paper"."""
+    """Its full name, such as "the Stream-to-Act paper"."""
     bars: Mapping[str, str] = field(default_factory=dict)
     """Name of a figure -> its `GreyBars`."""
     claims: str = ""
@@ -52,23 +52,23 @@ def against(about: str) -> str:
     No reference is loaded: this runs while its module may be under way.
     """
     offered = [f"{name}: {about.format(f'the {name}')}" for name in REFERENCES]
-    made: str = option("", "; ".join(offered), hidden=not offered)
-    return made
+    field: str = option("", "; ".join(offered), hidden=not offered)
+    return field
 
 
 def check_name(name: str, advice: str = "") -> None:
     """Raise UsageError, with ``advice``, for the name of no reference, and for a package that does not load."""
     if name and name not in REFERENCES:
-        known = " or ".join(REFERENCES) or "left out, as no installed package offers anything to be held against"
-        raise UsageError(f"`against`: '{name}' should be {known}{advice}")
+        names = " or ".join(REFERENCES) or "left out, as no installed package offers anything to be held against"
+        raise UsageError(f"`against`: '{name}' should be {names}{advice}")
     bars_of(name, "")
 
 
 def bars_of(name: str, figure: str) -> GreyBars:
-    """Return what a reference has beside a figure; nothing if ``name`` is empty."""
+    """Return the numbers that a reference has beside a figure; none if ``name`` is empty."""
     where = REFERENCES[name].bars.get(figure) if name else None
-    found: GreyBars = resolve_name(where) if where else GreyBars()
-    return found
+    reference_bars: GreyBars = resolve_name(where) if where else GreyBars()
+    return reference_bars
 
 
 class AgainstReference(Options):

@@ -65,7 +65,7 @@ class Recording(ImageMessages):
 
 
 def open_recording(path: str, option: str = "source") -> Any:
-    """Return an open reader of rosbags; raises SourceError, naming the option, for what is no recording."""
+    """Return an open reader of rosbags; raises SourceError, naming the option, for anything but a recording."""
     if not Path(path).exists():
         raise SourceError(f"`{option}`: no recording at {path}")
     try:
@@ -75,7 +75,7 @@ def open_recording(path: str, option: str = "source") -> Any:
         reader = Reader(path)
         reader.open()
         if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
-            raise ValueError("a topic's name or type is no text")
+            raise ValueError("a topic's name or type is not text")
     except Exception as error:  # rosbags raises any exception on a damaged file
         raise unreadable(path, error, option) from error
     return reader
@@ -83,9 +83,9 @@ def open_recording(path: str, option: str = "source") -> Any:
 
 def _connection(connections: list[Any], path: str, topic: str) -> Any:
     images = [connection for connection in connections if connection.msgtype in TYPES]
-    chosen = [connection for connection in images if topic in {"", connection.topic}]
-    if chosen:
-        return chosen[0]
+    matches = [connection for connection in images if topic in {"", connection.topic}]
+    if matches:
+        return matches[0]
     names = sorted({connection.topic for connection in images})
     if names:
         raise SourceError(f"`source`: {path} has no image topic {topic}; it has {', '.join(names)}")
@@ -98,6 +98,6 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
 def unreadable(path: str, error: Exception, option: str = "source") -> SourceError:
     reason = " ".join(str(error).split())[:MOST_QUOTED] or type(error).__name__
     return SourceError(
-        f"`{option}`: {path} is no recording that can be read ({reason}); it should be a rosbag2 folder, "
+        f"`{option}`: {path} is not a recording that can be read ({reason}); it should be a rosbag2 folder, "
         "a .mcap or a .db3 file. `mcap recover` repairs an .mcap that was cut short, `ros2 bag reindex` a folder"
     )

@@ -101,7 +101,7 @@ def encode_png(bgr: Pixels) -> Pixels:
 
 
 def decode_image(data: BytesLike) -> Pixels:
-    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError if it is none, or is too large.
+    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError for another file, or a too large one.
 
     A truncated JPEG is an error in OpenCV 5; OpenCV 4 fills in the missing part.
     """
@@ -154,7 +154,7 @@ def _decode(data: BytesLike, flags: int) -> Pixels:
     try:
         picture = cv2.imdecode(buffer, flags) if buffer.size else None
     except cv2.error as error:
-        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read: {error.err}") from error
+        raise ValueError(f"the {buffer.size} bytes are not a picture that OpenCV can read: {error.err}") from error
     if picture is None:
-        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read")
+        raise ValueError(f"the {buffer.size} bytes are not a picture that OpenCV can read")
     return cast("Pixels", picture)

@@ -46,7 +46,7 @@ class VideoFile(NumberedSource):
         """Open the file with FFmpeg alone: OpenCV's other back ends only add noise to the failure."""
         capture = cv2.VideoCapture(self._path, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         if not capture.isOpened():
-            raise SourceError(f"`source`: {self._path} is no video that OpenCV can read; try `ffprobe {self._path}`")
+            raise SourceError(f"`source`: {self._path} is not a video that OpenCV can read; try `ffprobe {self._path}`")
         return capture
 
 

@@ -37,7 +37,7 @@ class Stamped:
         digest = blake2b(f"{self._nonce}/{frame.index}".encode(), digest_size=SIDE * SIDE // 8).digest()
         bits = np.unpackbits(np.frombuffer(digest, np.uint8)).reshape(SIDE, SIDE)
         corner = frame.data[: 2 * SIDE, : 2 * SIDE]
-        height, width = corner.shape[:2]
+        height, width = corner.shape[:2]  # a frame may be smaller than the stamp
         luma = np.where(bits, np.uint8(WHITE), np.uint8(BLACK)).repeat(2, 0).repeat(2, 1)[:height, :width]
         if frame.encoding == "yuv422_yuy2":
             corner[..., 0], corner[..., 1] = luma, GREY

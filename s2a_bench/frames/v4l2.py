@@ -112,7 +112,7 @@ def _check_device(path: str) -> None:
     try:
         answer = fcntl.ioctl(device, VIDIOC_QUERYCAP, bytes(CAPABILITY.size))
     except OSError:
-        raise SourceError(f"`source`: {path} is no camera; `ls /dev/video*` shows those there are") from None
+        raise SourceError(f"`source`: {path} is not a camera; `ls /dev/video*` shows those there are") from None
     finally:
         os.close(device)
     *_, all_caps, device_caps = CAPABILITY.unpack(answer)

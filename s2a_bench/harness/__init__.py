@@ -1,1 +1,1 @@
-"""What is measured: sessions, interleaving, servers as processes, environment, guards."""
+"""The measuring harness: sessions, interleaving, servers as processes, environment, guards."""

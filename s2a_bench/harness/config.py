@@ -43,7 +43,7 @@ DEFAULT_TASK = "pick up the red block and place it in the box"
 
 if TYPE_CHECKING:
     TransportOptions: TypeAlias = Options
-else:  # a group of options for each transport; options that only `serve` has are no flags
+else:  # a group of options for each transport; options that only `serve` has get no flag
     TransportOptions = create_model(
         "PerTransport",
         __base__=Options,
@@ -153,19 +153,19 @@ class RequestsConfig(Surrounded):
     record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
     quick: bool = option(False, "fewer samples: a first look", first=True)
 
-    def __init__(self, **given: Any) -> None:
+    def __init__(self, **arguments: Any) -> None:
         """Apply the defaults of ``quick``; ``url`` sets the option of the transport that its scheme names.
 
         Raises UsageError naming the field.
         """
-        given = {**self.QUICK, **given} if given.get("quick") else given
-        if url := given.get("url"):
-            name, groups = named_by(url), dict(given.get("options") or {})
+        arguments = {**self.QUICK, **arguments} if arguments.get("quick") else arguments
+        if url := arguments.get("url"):
+            name, groups = named_by(url), dict(arguments.get("options") or {})
             values = groups.get(name, {})
             values = values.given_values() if isinstance(values, Options) else values
-            given["options"] = {**groups, name: {**values, "url": url}}
-            given.setdefault("transports", (name,))
-        super().__init__(**given)
+            arguments["options"] = {**groups, name: {**values, "url": url}}
+            arguments.setdefault("transports", (name,))
+        super().__init__(**arguments)
 
     @property
     def names(self) -> Sequence[str]:
@@ -187,8 +187,8 @@ class RequestsConfig(Surrounded):
 
     @cached_property
     def surroundings(self) -> tuple[Surroundings, ...]:
-        asked = (each.of(self, self.pipelines) for _, each in SURROUNDINGS.loaded())
-        return tuple(each for each in asked if each)
+        wanted = (each.of(self, self.pipelines) for _, each in SURROUNDINGS.loaded())
+        return tuple(each for each in wanted if each)
 
     @property
     def usual_payloads(self) -> tuple[str, ...]:
@@ -261,8 +261,8 @@ class RequestsConfig(Surrounded):
         if not (pipeline.transport.serves or pipeline.black_box):
             scheme = pipeline.transport.urls.schemes[0]
             raise UsageError(f"`transport` {pipeline.name} is a client alone: name its `url`, {scheme}://HOST:PORT")
-        chosen = Choice(pipeline.options, pipeline.variant, self.mode, self.engine.name, self.cameras, self.state)
-        pipeline.transport.require(chosen)
+        choice = Choice(pipeline.options, pipeline.variant, self.mode, self.engine.name, self.cameras, self.state)
+        pipeline.transport.require(choice)
         require_payload(pipeline, self.mode, resized=self.resize is not None)
         self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
         if pipeline.engine and pipeline.options.external_address:
@@ -289,21 +289,21 @@ class RequestsConfig(Surrounded):
     def _check_unused(self) -> None:
         """Refuse an external server or its options that no cell uses, and a model that no server loads."""
         used = {(each.transport.name, each.options.external) for each in self.pipelines}
-        for name, given in self.options:
-            transport, field = TRANSPORTS[name], given.external
+        for name, opts in self.options:
+            transport, field = TRANSPORTS[name], opts.external
             if field and (name, field) not in used:
                 variants = transport.variants if name in dict(used) else ()
-                able = [each for each in variants if transport.capabilities(Choice(given, each)).options.external]
+                able = [each for each in variants if transport.capabilities(Choice(opts, each)).options.external]
                 fit = [f"{name}/{each}" for each in able]
                 raise UsageError(f"`{field}` needs {' or '.join(fit) or name} among `transport`")
         if self.wait_for_server and not any(each.options.external_address for each in self.pipelines):
             raise UsageError("`wait_for_server` is about a server that runs already; name it with `url`")
-        chosen = [each.options for each in self.pipelines]
-        useful = {name for each in chosen for name in each.model_fields_set - each.without_effect}
-        if useless := {name for each in chosen for name in each.without_effect} - useful:
+        cell_options = [each.options for each in self.pipelines]
+        useful = {name for each in cell_options for name in each.model_fields_set - each.without_effect}
+        if useless := {name for each in cell_options for name in each.without_effect} - useful:
             raise UsageError(f"`{min(useless)}` is about a server that runs already; name it with `url`")
-        if (given := self.engine.of_model) and not self.reads_model:
-            raise UsageError(f"`{given}`: no server of this run loads a model; leave it out with `{self.foreign}`")
+        if (flag := self.engine.of_model) and not self.reads_model:
+            raise UsageError(f"`{flag}`: no server of this run loads a model; leave it out with `{self.foreign}`")
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
         yield from super().risks()

@@ -66,7 +66,7 @@ class StreamedFrame:
     sequence: int = 0
     """Frames published so far, this one included."""
     clock_error_ns: int | None = None
-    """Of the server's marks, if its clock is another."""
+    """Error of the server's marks, if its clock is another host's."""
 
     @property
     def key(self) -> int:

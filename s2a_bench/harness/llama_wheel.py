@@ -46,6 +46,7 @@ def main() -> int:
     params.model.path, params.mmproj.path = settings["model"], settings["mmproj"]
     if settings["chat_template"]:
         params.chat_template, params.use_jinja = settings["chat_template"], True
+    # one slot, as slots divide the context among them; fitting would change these settings to the free memory
     params.n_ctx, params.n_parallel, params.fit_params = settings["context"], 1, False
     params.n_batch = params.n_ubatch = settings["batch"]
     params.cpuparams.n_threads = params.cpuparams_batch.n_threads = settings["threads"]

@@ -30,7 +30,7 @@ def together(checksums: Iterable[int]) -> int:
 def fingerprint(pixels: Pixels) -> int:
     """Weight each group of eight bytes by a different odd number and sum, modulo 2^64; fold to 52 bits.
 
-    A changed group changes the sum, and so do groups that change places. It is no defence against forgery.
+    A changed group changes the sum, and so do groups that change places. It does not protect against forgery.
     """
     data = pixels.reshape(-1)
     whole = data.size // 8 * 8

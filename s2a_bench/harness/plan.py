@@ -1,4 +1,4 @@
-"""The plan of a run of requests: all that follows from its configuration, decided once."""
+"""The run plan of requests: all that follows from a configuration, decided once."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class BlocksPlan:
 
 @dataclass(frozen=True, slots=True)
 class FeedPlan:
-    """Where pictures come from, and how a request gets them."""
+    """The source of pictures, and how a request gets them."""
 
     source: str
     size: tuple[int, int]
@@ -69,6 +69,7 @@ class RequestPlan:
     state: int
     """Length of the robot's state."""
     mode: str
+    """The request mode: request or stream."""
     size: str
     stages: Mapping[str, str]
     """Stage -> group of all transports, in the order of the path."""
@@ -82,23 +83,23 @@ class RunPlan:
     feed: FeedPlan
     request: RequestPlan
     engine: EngineConfig
-    """Of all cells; a cell's name may change some of its options."""
+    """The engine of all cells; a cell's name may change some of its options."""
     tuned: bool
     """Whether this process and the servers keep large blocks of memory for the next picture."""
     timeout_s: float
     deadline_s: float
     wait_s: float
-    """How long an external server may take to start."""
+    """The longest start of an external server."""
     finds_model: bool
     """Whether the model's files are yet to be found."""
     sample_resources_hz: float
     record: Path | None
     namespace: str
-    """Of the recorded topics."""
+    """The namespace of the recorded topics."""
     checks: Mapping[str, str]
     """Code -> the doctor's checks that concern the transports."""
     manifest: Mapping[str, Any]
-    """The manifest's entries about the plan."""
+    """The manifest's entries about the run plan."""
 
     def with_manifest(self, **facts: Any) -> RunPlan:
         return replace(self, manifest={**self.manifest, **facts})
@@ -121,10 +122,10 @@ def answered(config: RequestsConfig, say: Callable[[str], None]) -> RequestsConf
         return _without_our_engine(config, say)
     if config.COMPUTES:
         return config
-    chosen = config.but(engine=engine.but(name=engine.default_name(say)))
-    if left_out := {each.name for each in config.pipelines} - {each.name for each in chosen.pipelines}:
+    resolved = config.but(engine=engine.but(name=engine.default_name(say)))
+    if left_out := {each.name for each in config.pipelines} - {each.name for each in resolved.pipelines}:
         say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
-    return chosen
+    return resolved
 
 
 def _without_our_engine(config: RequestsConfig, say: Callable[[str], None]) -> RequestsConfig:
@@ -140,15 +141,15 @@ def _without_our_engine(config: RequestsConfig, say: Callable[[str], None]) -> R
 
 def _is_named(config: RequestsConfig, cell: Pipeline, others: Sequence[Pipeline]) -> bool:
     """Whether the user named a cell, or its transport, of which ``others`` has none."""
-    transport, given = cell.transport.name, "transports" in config.model_fields_set
-    written = {name.partition("?")[0] for name in config.names} if given else set()
+    transport, explicit = cell.transport.name, "transports" in config.model_fields_set
+    written = {name.partition("?")[0] for name in config.names} if explicit else set()
     named = transport in {*written, *config.options.model_fields_set}
     alone = all(each.transport is not cell.transport for each in others)
     return cell.name.partition("?")[0] in written or (named and alone)
 
 
 def resolve(config: RequestsConfig, say: Callable[[str], None]) -> RunPlan:
-    """Decide what follows from a configuration, and ``say`` what is chosen; opens and starts nothing.
+    """Derive the run plan from a configuration, and ``say`` what is chosen; opens and starts nothing.
 
     Raises MissingExtra if a library that the engine or a server program needs is not installed.
     """

@@ -193,7 +193,7 @@ def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: C
             server.wait_end()
             return server.address, server.death()
 
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt):  # Ctrl-C is how a user ends it
         address, death = serve(job)
         died(f"{death}; it is started again, once")
         _, death = serve(replace(job, wiring=replace(job.wiring, address=address, restarted=True)))
@@ -253,6 +253,7 @@ class LlamaServerProcess(ServerProcess):
             if not self.alive():
                 raise self.no_start()
             try:
+                # alive: the port was free only until `_free_port` closed it, so another server may answer
                 ready = httpx.get(self.address + "/health", trust_env=False).is_success and self.alive()
             except httpx.TransportError:
                 ready = False  # it does not listen yet
@@ -299,7 +300,7 @@ def start_program(program: Program, engine: EngineConfig, log: Path, *, has_gram
 
 def _free_port(wanted: int) -> int:
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # else a connection in TIME_WAIT holds the port
         try:
             probe.bind(("127.0.0.1", wanted))
             probe.listen()

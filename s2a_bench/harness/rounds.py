@@ -54,10 +54,10 @@ class RunningLaunch:
 
     number: int
     plan: RunPlan
-    """With the paths of the model files."""
+    """The run plan, with the paths of the model files."""
     writer: RunWriter
     sessions: Sequence[Session]
-    """In the order of the cells, `Task.clients` of each cell one after the other."""
+    """`Task.clients` sessions for each cell, in the order of the cells."""
     servers: ServerSet
     guard: SampleGuard
     progress: Progress
@@ -105,7 +105,7 @@ def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """How a measuring command differs from others with the same plan."""
+    """The settings of one measuring command; others with the same run plan differ in these."""
 
     command: str
     drive: Callable[[RunningLaunch], None] = in_blocks
@@ -114,7 +114,7 @@ class Task:
     tables: Sequence[Table[Any]] = ()
     """Tables whose files exist from the start, besides those of requests."""
     source: Callable[[FeedPlan], FrameSource] | None = None
-    """Opens the one camera, whose pictures are stamped already; None: the plan's source, stamped for each cell."""
+    """Opens the one camera, whose pictures are stamped already; None: the run plan's source, stamped for each cell."""
 
 
 def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) -> Path:
@@ -291,8 +291,8 @@ class _Run:
             stack.callback(camera.stop)
         for cell, place in product(self.plan.cells, range(self.task.clients)):
             client = servers.client(cell)
-            made: list[Session] = []
-            clients.callback(_close_idle, client, made)
+            opened: list[Session] = []
+            clients.callback(_close_idle, client, opened)
             feed: Feed
             if camera is not None:
                 random = Random(plan.seed)  # noqa: S311 - phases, not secrets
@@ -302,8 +302,9 @@ class _Run:
                 user = f"{cell.name} {place}" if place else cell.name
                 source = self.sources.of(user, user if cell.black_box or place else "")
                 feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
-            made.append(Session(cell, client, feed, self.plan.request, recorder, sampler, servers.origin(cell), clocks))
-            yield made[0]
+            origin = servers.origin(cell)
+            opened.append(Session(cell, client, feed, self.plan.request, recorder, sampler, origin, clocks))
+            yield opened[0]
 
 
 def _close_idle(client: Client, sessions: Sequence[Session]) -> None:

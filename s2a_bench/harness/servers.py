@@ -137,9 +137,10 @@ class ServerSet:
         """Return the engine's facts about the model that all cells share: a started server's, else a program's."""
         started = {server.name for server in self._servers.values() if isinstance(server.process, OwnServer)}
         names = sorted(facts, key=lambda name: name not in started)
-        known = self._local_facts or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
+        engines = (facts[name]["engine"] for name in names if "engine" in facts[name])
+        engine_facts = self._local_facts or next(engines, {})
         differs = {name for pipeline in self._plan.cells for name, _ in pipeline.engine}
-        return {name: fact for name, fact in known.items() if name not in differs}
+        return {name: fact for name, fact in engine_facts.items() if name not in differs}
 
     def origin(self, pipeline: Pipeline) -> Provenance:
         """Return the provenance of a cell's answers, as its engine reports it; unknown for an external server."""

@@ -50,6 +50,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
                 if not trace.token_ns:
                     if preprocess_ms := engine.facts.get(PREPROCESS_MS):
                         handed_ns = trace.marks[-1][1]
+                        # at most now: marks are in order of time, whatever the engine reports
                         trace.marks.append(("preprocess", min(handed_ns + round(preprocess_ms * 1e6), now)))
                     trace.marks.append(("inference", now))
                 trace.token_ns.append(now)
@@ -92,7 +93,7 @@ def stop_soon(server: Server) -> None:
         SystemClock().sleep_until_ns(now_ns() + round(GRACE_S * 1e9))
         sys.stderr.write(f"the server still runs {GRACE_S:g} s after its stop: killed\n")
         sys.stderr.flush()
-        os._exit(0)
+        os._exit(0)  # `sys.exit` would end this thread alone
 
     Thread(target=stop, daemon=True).start()  # a signal's handler may have interrupted a lock's holder
 

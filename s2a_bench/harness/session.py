@@ -11,15 +11,7 @@ from typing import Any, TypeAlias
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import clock_id, now_ns
-from s2a_bench.errors import (
-    EngineError,
-    RequestFailed,
-    S2AError,
-    ServerDied,
-    SourceError,
-    TransportError,
-    UsageError,
-)
+from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, TransportError, UsageError
 from s2a_bench.facts import (
     CACHE_N,
     CAMERA_FRAMES,
@@ -84,7 +76,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class RequestContext:
-    """How one request differs from others of the run, and the receivers of its pieces as they arrive."""
+    """The settings of one request that differ from the run's, and the receivers of its pieces as they arrive."""
 
     state: tuple[float, ...] | None = None
     """The robot's; None: a synthetic state."""
@@ -100,7 +92,7 @@ PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
 SMALL = (16, 16)
 LONGEST_PAUSE_S = 4.0
-"""Of the pauses between failures in a row of a server that may be starting, from 1 s before the third on."""
+"""The longest pause after failures in a row of a server that may be starting; the first, after two, is 1 s."""
 KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
@@ -118,14 +110,14 @@ class Session:
     origin: Provenance = UNKNOWN_ORIGIN
     """It is replaced by the provenance that an answer carries."""
     clocks: InitVar[dict[str, Any] | None] = None
-    """What sessions share of other hosts' clocks; see `Surroundings.clock` for none."""
+    """The state of other hosts' clocks that sessions share; see `Surroundings.clock` for None."""
 
     def __post_init__(self, clocks: dict[str, Any] | None) -> None:
         others = (each.clock(self._exchange, clocks) for each in self.request.surroundings)
         self._clock = next(filter(None, others), None)
         self._frames: dict[int, StreamedFrame] = {}
         self._pictures = 0
-        """Of the last request."""
+        """Number of pictures of the last request."""
         self._absent, self.answered = 0, False
         """Failures in a row of a server that may be starting; whether it has answered."""
         self.busy = False
@@ -168,6 +160,7 @@ class Session:
             error, fatal = INTERRUPTED, interrupt
         self.sampler.edge()
         self._pictures = len(frames)
+        # of the whole answer: a secret may span pieces
         texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [(replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at) for piece, at in seen]
         trace.facts.update(self.sampler.window(started_ns, now_ns()))
@@ -253,7 +246,7 @@ class Session:
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
         rgb_source = together(fingerprint(to_rgb(frame)) for frame in frames) if frames else None
-        rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
+        rgb_engine = _whole(facts.pop(RGB_ENGINE, None))  # it becomes a column
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
         age_ns = started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None
@@ -301,6 +294,7 @@ class Session:
                 engine_lo_ns=left_ns - joined.early_ns if joined and left_ns else None,
                 engine_hi_ns=min(left_ns + joined.late_ns, client_ns) if joined and left_ns else None,
             )
+            # A server that reports no times, or fewer than tokens, leaves null.
             for (token, client_ns), left_ns in zip(seen, chain(engine_ns, repeat(None)), strict=False)
         ]
         return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
@@ -321,6 +315,7 @@ class Session:
         if self.feed.sink is not None:
             used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
             if used is not None and trace.remote is not None:
+                # Once: the frame may be the newest for several answers.
                 if not used.used_by and trace.remote.clock == clock_id():
                     used.marks = [*used.marks, *trace.remote.frame_marks]
                     used.clock_error_ns = max(joined.early_ns, joined.late_ns) if joined else None

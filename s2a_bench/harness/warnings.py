@@ -24,18 +24,18 @@ from s2a_bench.transport.pipeline import Pipeline
 
 CLOCK_STEP_NS = 50_000_000
 LEVEL: Final = 0.01
-"""Of the test for changed delays."""
+"""The significance level of the test for changed delays."""
 SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
 AWAKE_MS = 2.0
-"""How much later than the end of a server's sleep its client sees the first of the answers."""
+"""The longest time from the end of a server's sleep to its first answer at the client."""
 PILE_MS, PILED = 0.5, 0.1
 """The width of the pile at the end of a sleep, and the share of answers in it that raises the warning."""
 
 
 def before_run(checks: Mapping[str, str] | None = None, machine: Machine | None = None) -> list[RunWarning]:
-    """Return the doctor's warnings that concern any run, and those of a plan's ``checks``."""
+    """Return the doctor's warnings that concern any run, and those of a run plan's ``checks``."""
     return warnings_of(examine(machine or Machine(), {code: CHECKS[code] for code in BEFORE_RUN} | dict(checks or {})))
 
 
@@ -173,7 +173,7 @@ DOUBTS: Final = (
     *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE),
     *(UNCOUNTED, RECONNECTED, OVERTAKEN, STALE, LOST, FAILED),
 )
-"""In the order of the warnings."""
+"""The conditions, in the order of the warnings."""
 
 
 class SampleGuard:
@@ -255,13 +255,13 @@ class SampleGuard:
 
     def _odd_facts(self) -> list[RunWarning]:
         where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in self._odd.items() if odd)
-        what = f"a server reported facts that are no number, or an impossible one ({where})"
+        what = f"a server reported facts that are not numbers, or impossible ones ({where})"
         advice = "these facts are absent where they were odd: report it to the operator of the server"
         return [RunWarning("odd-facts", what, advice)] if where else []
 
     def advice(self, cells: Iterable[str]) -> str:
-        known = [self._cells[name] for name in cells if name in self._cells]
-        return "; ".join(dict.fromkeys(cell.transport.against_loss(cell.options) for cell in known))
+        lossy = [self._cells[name] for name in cells if name in self._cells]
+        return "; ".join(dict.fromkeys(cell.transport.against_loss(cell.options) for cell in lossy))
 
     def _correlated(self) -> list[RunWarning]:
         """Check whether neighbouring samples are correlated; intervals over several launches do not depend on it."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NoParameters:
-    """Of most engines."""
+    """The parameters of most engines: none."""
 
 
 class Engine(Protocol):
@@ -156,7 +156,7 @@ SAMPLER_ARGUMENTS = {
 LEAST_CONTEXT, LEAST_BATCH, LARGEST = 256, 32, 1 << 20
 
 
-def _known(written: str) -> str:
+def _check_engine(written: str) -> str:
     if (name := written.partition("?")[0]) not in ENGINES:
         raise ValueError(none_of(name, ENGINES))
     return written
@@ -173,7 +173,7 @@ Written = Annotated[str, BeforeValidator(_written, json_schema_input_type=str | 
 class EngineConfig(Options):
     PANEL: ClassVar[str] = "Model"
 
-    name: Annotated[str, AfterValidator(_known)] = option(
+    name: Annotated[str, AfterValidator(_check_engine)] = option(
         MODEL,
         f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED), "
         "call?function=MODULE:NAME is your own",
@@ -184,8 +184,7 @@ class EngineConfig(Options):
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path", names=profile_files)
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
     latency: Written = option(
-        "",
-        "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
+        "", "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]"
     )
     model: Path | None = option(None, "GGUF, name, or hub:OWNER/REPO[:FILE] [default: the tiny dummy]", first=True)
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
@@ -285,9 +284,9 @@ def declared_engine(name: str) -> type[Engine]:
 def check_engine(config: EngineConfig) -> None:
     """Raise UsageError for an option of another engine, and for options that contradict each other."""
     for name, kind in ENGINES.loaded():
-        given = next((option for option in kind.exclusive_options if getattr(config, option)), "")
-        if given and name != config.name:
-            raise UsageError(f"`{given}` needs `engine` {name}; `engine` {config.name} answers at its own speed")
+        option_name = next((option for option in kind.exclusive_options if getattr(config, option)), "")
+        if option_name and name != config.name:
+            raise UsageError(f"`{option_name}` needs `engine` {name}; `engine` {config.name} answers at its own speed")
     config.kind.check(config)
 
 
@@ -357,7 +356,7 @@ def swing(horizon: int, dims: int, seed: int) -> NDArray[np.float32]:
 
     ticks, joints = np.arange(horizon)[:, None], np.arange(dims)[None, :]
     values = np.sin(tau * (ticks + seed) / PERIOD + joints).astype(np.float32)
-    values.flags.writeable = False
+    values.flags.writeable = False  # cached: requests share it
     return values
 
 
@@ -371,7 +370,7 @@ def chunk(config: EngineConfig, request: Request) -> Iterator[Action]:
 Size: TypeAlias = Literal["tiny", "full"]
 Like: TypeAlias = Literal["minicpm-v-2.6", "qwen2.5-vl-3b", "smolvlm2-500m", "gemma3-4b"]
 Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
-"""Of dummy weights."""
+"""The quantisation of dummy weights."""
 
 
 class FetchConfig(Options):

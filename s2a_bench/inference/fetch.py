@@ -51,7 +51,7 @@ def fetch(config: FetchConfig) -> Fetched:
     getLogger("huggingface_hub").setLevel(ERROR)  # it logs each retry with the whole, signed address
     info = _call(api.model_info, repository, files_metadata=True, timeout=timeout_s)
     lfs = {sibling.rfilename: sibling.lfs for sibling in info.siblings or ()}
-    names = chosen(repository, file, config, lfs)
+    names = selected_files(repository, file, config, lfs)
     if unchecked := [name for name in names if not lfs[name]]:
         raise ModelError(
             f"{repository}: gives no SHA-256 for {unchecked[0]}, so it cannot be checked; fetch it by hand"
@@ -60,7 +60,7 @@ def fetch(config: FetchConfig) -> Fetched:
     for name in reversed(names):  # a language model that is there without its mmproj would pass for a text model
         path = Path(_call(api.hf_hub_download, repository, filename=name, revision=info.sha))
         if (digest := sha256(path)) != lfs[name].sha256:
-            for each in {path, path.resolve()}:
+            for each in {path, path.resolve()}:  # the cache's link, and the file that it leads to
                 each.unlink()
             raise ModelError(
                 f"{name}: has SHA-256 {digest}, the hub says {lfs[name].sha256}; it was deleted, fetch again"
@@ -69,7 +69,7 @@ def fetch(config: FetchConfig) -> Fetched:
     return Fetched(api.endpoint, repository, info.sha, tuple(files))
 
 
-def chosen(repository: str, file: str, config: FetchConfig, listed: Collection[str]) -> list[str]:
+def selected_files(repository: str, file: str, config: FetchConfig, listed: Collection[str]) -> list[str]:
     """Return the names of the language model, ``file`` if given, and of the mmproj, if there is one.
 
     They are of the repository's names ``listed``, in upper or lower case. Raises ModelError if none fits, or several.
@@ -85,8 +85,8 @@ def chosen(repository: str, file: str, config: FetchConfig, listed: Collection[s
                 f"{repository}: no model is {quants}, or several; it has {there}; name one as OWNER/REPO:FILE"
             )
         wanted = [str(models[0]), config.mmproj or str(mmproj or "")]
-    known = {name.lower(): name for name in listed} | {name: name for name in listed}
-    names = {name: known.get(name, known.get(name.lower(), "")) for name in wanted if name}
+    by_lower = {name.lower(): name for name in listed} | {name: name for name in listed}
+    names = {name: by_lower.get(name, by_lower.get(name.lower(), "")) for name in wanted if name}
     if missing := [name for name, listed_as in names.items() if not listed_as]:
         raise ModelError(f"{repository}: has no {missing[0]}; it has {there}")
     return [*names.values()]

@@ -82,10 +82,10 @@ class _Cursor:
 def read_header(path: Path, flag: str) -> GgufHeader:
     """Read the header of ``path`` and check that every tensor lies within the file.
 
-    Raises ModelError, which names ``flag``, if the file is missing, no GGUF, damaged or truncated.
+    Raises ModelError, which names ``flag``, if the file is missing, not GGUF, damaged or truncated.
     """
     try:
-        if path.is_fifo() or path.is_char_device():
+        if path.is_fifo() or path.is_char_device():  # opening a pipe would wait for its writer
             raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
         with path.open("rb") as file:
             if not os.fstat(file.fileno()).st_size:

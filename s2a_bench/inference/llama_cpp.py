@@ -38,13 +38,7 @@ from s2a_bench.inference import (
     EngineConfig,
     llama_log,
 )
-from s2a_bench.inference.llama_decode import (
-    GrammarSampler,
-    TokenBatch,
-    TokenBytes,
-    beyond_limits,
-    grammar_error,
-)
+from s2a_bench.inference.llama_decode import GrammarSampler, TokenBatch, TokenBytes, beyond_limits, grammar_error
 from s2a_bench.inference.llama_prompt import ChatTemplate, TooLong, VisionTower, evaluate_text
 from s2a_bench.inference.models import load_headers
 from s2a_bench.types import Frame, Request, Token
@@ -77,7 +71,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
     def sampler(self, name: str, grammar: str, settings: Mapping[str, float]) -> Any:
         """Build the sampling ``name``, with some ``settings`` replaced, as a chain of samplers under a grammar."""
         last_n = int(settings.get(PENALTY_LAST_N, LAST_N))
-        self.last_n_tokens_size = self.n_ctx() if last_n < 0 else last_n
+        self.last_n_tokens_size = self.n_ctx() if last_n < 0 else last_n  # -1 is llama.cpp's "all of the context"
         arguments = {SAMPLER_ARGUMENTS[key]: value for key, value in settings.items() if key in SAMPLER_ARGUMENTS}
         chain = self._init_sampler(**SAMPLINGS[name] | arguments)
         return GrammarSampler(chain, self._model.vocab, grammar, self._candidates) if grammar else chain
@@ -118,7 +112,7 @@ class LlamaCppEngine(Engine):
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
         llama_log.silence()
-        llama_log.reason()
+        llama_log.reason()  # forgets what another model logged
         self._llama: _Prefilled | None = self._load()
         self._batch = TokenBatch()
 
@@ -187,7 +181,7 @@ class LlamaCppEngine(Engine):
             for index in range(request.max_tokens):
                 started_ns = now_ns()
                 token = next(ids)
-                if index == 1:
+                if index == 1:  # the first token is sampled from the prompt's logits, without a decode
                     self._facts[FIRST_DECODE_MS] = (now_ns() - started_ns) / _MS_NS
                 if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
                     return
@@ -203,7 +197,7 @@ class LlamaCppEngine(Engine):
     def _evaluate(self, llama: _Prefilled, request: Request) -> tuple[int, int]:
         """Evaluate pictures and prompt, on an empty KV cache, up to the first token's logits; return its times."""
         prompt = self._template.prompt(request.prompt, len(request.images) if self._files.mmproj else 0)
-        llama_log.reason()
+        llama_log.reason()  # forgets what an earlier request logged
         llama_cpp.llama_perf_context_reset(llama.ctx)
         try:
             times = self._prefill(llama, prompt, request.images, llama.n_ctx() - request.max_tokens)

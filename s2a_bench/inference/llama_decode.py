@@ -123,7 +123,7 @@ def grammar_error(vocab: Any, grammar: str) -> str:
 
     llama.cpp's parser writes to stderr, which is therefore redirected meanwhile, for the whole process.
     """
-    llama_log.reason()
+    llama_log.reason()  # forgets earlier errors
     with tempfile.TemporaryFile() as file:
         saved = os.dup(_STDERR)
         os.dup2(file.fileno(), _STDERR)

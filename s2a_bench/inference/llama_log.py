@@ -14,7 +14,7 @@ llama_cpp = extras.require("llama_cpp", "llama")
 mtmd_cpp = extras.require("llama_cpp.mtmd_cpp", "llama")
 
 VARIABLE = "S2A_BENCH_LLAMA_LOG"
-"""If it is 1, llama.cpp writes to stderr."""
+"""The environment variable with which, set to 1, llama.cpp writes to stderr."""
 
 _ERROR = 4  # GGML_LOG_LEVEL_ERROR of ggml.h; the bindings' own list is out of date
 _lines: deque[str] = deque(maxlen=20)

@@ -129,12 +129,13 @@ class VisionTower:
         encode_ns, reached = now_ns() - started_ns, llama_cpp.llama_pos(0)
         if not code:
             embedding = mtmd_cpp.mtmd_get_output_embd(self._mtmd)
+            # the helper also decodes non-causally where the model wants that for pictures (Gemma 3)
             decode, end = mtmd_cpp.mtmd_helper_decode_image_chunk, ctypes.byref(reached)
             code = decode(self._mtmd, llama.ctx, chunk, embedding, past, 0, llama.n_batch, end, _NO_CALLBACK, None)
             llama_cpp.llama_synchronize(llama.ctx)
         if code:
             raise ValueError(f"Failed to evaluate chunk: error code {code}")
-        llama.n_tokens = reached.value
+        llama.n_tokens = reached.value  # the library counts positions as tokens; with M-RoPE there are fewer
         return encode_ns
 
 

@@ -31,11 +31,11 @@ class ListedModel:
 
 def listed() -> Iterator[ListedModel]:
     """Yield a row for each known model, then for each other one in the hub's cache, then for the dummies."""
-    known, fetched = {repository: name for name, repository in HUB_MODELS.items()}, cached()
-    for repository in dict.fromkeys((*known, *sorted(fetched))):
+    by_repository, fetched = {repository: name for name, repository in HUB_MODELS.items()}, cached()
+    for repository in dict.fromkeys((*by_repository, *sorted(fetched))):
         models, mmproj = pair(fetched.get(repository, ()))
-        name = known.get(repository, f"{HUB}{repository}")
-        if not models and repository in known:
+        name = by_repository.get(repository, f"{HUB}{repository}")
+        if not models and repository in by_repository:
             yield ListedModel(name, "not here", {})
         for model in models:
             yield _row(name if len(models) == 1 else f"{HUB}{repository}:{model.name}", model, mmproj)
@@ -71,11 +71,11 @@ def picture_tokens(model: Path, mmproj: Path, width: int = 640, height: int = 48
     params.use_gpu = params.warmup = params.print_timings = False
     with ExitStack() as stack:
 
-        def opened(path: Path, made: Any, free: Any) -> Any:
-            if not made:
+        def opened(path: Path, handle: Any, free: Any) -> Any:
+            if not handle:
                 raise ModelError(f"file {path}: llama.cpp: {llama_log.reason() or 'cannot load it'}")
-            stack.callback(free, made)
-            return made
+            stack.callback(free, handle)
+            return handle
 
         vocab = llama.llama_model_load_from_file(str(model).encode(), model_params)
         vocab = opened(model, vocab, llama.llama_model_free)

@@ -65,8 +65,8 @@ def pair(files: Iterable[Path], quants: Iterable[str] = ()) -> tuple[list[Path],
 
 def _of_quant(paths: list[Path], quants: Iterable[str]) -> list[Path]:
     endings = (re.compile(rf"(.*[-._])?{re.escape(quant)}\.gguf", re.IGNORECASE) for quant in quants)
-    chosen = ([path for path in paths if ending.fullmatch(path.name)] for ending in endings)
-    return next(filter(None, chosen), paths)
+    matches = ([path for path in paths if ending.fullmatch(path.name)] for ending in endings)
+    return next(filter(None, matches), paths)
 
 
 def cached() -> dict[str, list[Path]]:
@@ -113,7 +113,7 @@ class ModelFiles:
         return any(header.is_dummy for header in (self.model, self.mmproj) if header)
 
     def describe(self) -> dict[str, str | bool]:
-        """Return what a manifest tells of the files; the first call hashes them, which takes seconds for gigabytes."""
+        """Return a manifest's facts about the files; the first call hashes them, which takes seconds for gigabytes."""
         facts: dict[str, str | bool] = {"dummy": self.dummy, "name": str(self.model.fields.get("general.name", ""))}
         for kind, header in (("model", self.model), ("mmproj", self.mmproj)):
             if header:
@@ -123,8 +123,8 @@ class ModelFiles:
 
 def cache_folder() -> Path:
     """Return the user's cache folder of s2a-bench, or that of the variable S2A_BENCH_CACHE."""
-    if chosen := os.environ.get(CACHE_VARIABLE):
-        return Path(chosen)
+    if folder := os.environ.get(CACHE_VARIABLE):
+        return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "s2a-bench"
 
 
@@ -185,15 +185,15 @@ def load_headers(config: EngineConfig) -> ModelFiles:
 
 def chat_template(config: EngineConfig) -> str:
     """Return the chosen chat template, a Jinja text; empty: the model's own; raises ModelError."""
-    chosen = config.chat_template
-    if chosen in {"", NO_TEMPLATE}:
-        return RAW_PROMPT if chosen else ""
+    template_name = config.chat_template
+    if template_name in {"", NO_TEMPLATE}:
+        return RAW_PROMPT if template_name else ""
     try:
-        if template := read_text(Path(chosen), TEMPLATE_BYTES):
+        if template := read_text(Path(template_name), TEMPLATE_BYTES):
             return template
         raise ValueError("it is empty")
     except (OSError, ValueError) as error:
-        raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
+        raise ModelError(f"`chat_template` {template_name}: cannot be read ({error})") from error
 
 
 def _mmproj_beside(model: Path) -> Path | None:
@@ -218,7 +218,7 @@ def sha256(path: Path) -> str:
     with path.open("rb") as content:
         while block := content.read(1 << 22):
             computed.update(block)
-    with suppress(OSError):
+    with suppress(OSError):  # without the note it is computed again
         note.parent.mkdir(parents=True, exist_ok=True)
         note.write_text(json.dumps({"path": str(path.resolve()), "sha256": computed.hexdigest()}))
     return computed.hexdigest()

@@ -52,7 +52,7 @@ class _Answer:
 
     def cancel(self) -> None:
         self.wanted = False
-        self._places.put(None)
+        self._places.put(None)  # wakes a writer that waits for a place
 
 
 class OneThreadEngine(Engine):
@@ -94,7 +94,7 @@ class OneThreadEngine(Engine):
 
     def close(self) -> None:
         if not self._closed:
-            self._answer.cancel()
+            self._answer.cancel()  # else the thread may wait for the reader, and `close` for the thread
             self._submit(self._engine.close).result()
             self._closed = True
             self._end_thread()

@@ -20,4 +20,4 @@ class WallClock(NamedTuple):
 
 
 WALL_CLOCKS: Final[Registry[Callable[[], WallClock]]] = Registry("wall_clocks", "clock", {})
-"""What knows the error -> a function that reads both; it raises RequestFailed if there is nothing to be known."""
+"""Service that knows the clock's error -> a function that reads both; raises RequestFailed if it knows nothing."""

@@ -12,7 +12,7 @@ from s2a_bench.errors import UsageError
 LOCAL: Final = "local"
 PROBE_S: Final = 5.0
 OBJECT_STORE_BYTES: Final = 256 << 20
-"""For a local cluster: run folders are small."""
+"""The object store of a local cluster: run folders are small."""
 
 
 def connect(address: str, jobs: int) -> Any:

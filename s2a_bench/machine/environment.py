@@ -70,13 +70,13 @@ def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
 
 
 def board_facts() -> dict[str, Any]:
-    known = collect()
+    machine_facts = collect()
     facts = {
-        "model": known.get("board"),
-        "gpu": next((gpu.get("name") for gpu in known.get("gpus", [])), None),
-        "cpu": known.get("cpu"),
+        "model": machine_facts.get("board"),
+        "gpu": next((gpu.get("name") for gpu in machine_facts.get("gpus", [])), None),
+        "cpu": machine_facts.get("cpu"),
         "cores": len(os.sched_getaffinity(0)),
-        **{name: known.get(name) for name in ("memory_bytes", "power_mode", "governor")},
+        **{name: machine_facts.get(name) for name in ("memory_bytes", "power_mode", "governor")},
     }
     return {key: value for key, value in facts.items() if value}
 

@@ -115,12 +115,12 @@ def _padded(plain: Format, text: str, fillers: Sequence[str], target: int, token
     return None
 
 
-def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bool:
-    numbers = range(1, n_skills + 1) if chosen.numbered else (1,)
-    if any(count != target for count in chosen.counts(tokenize, numbers)):
+def _holds(form: Format, target: int, tokenize: Tokenize, n_skills: int) -> bool:
+    numbers = range(1, n_skills + 1) if form.numbered else (1,)
+    if any(count != target for count in form.counts(tokenize, numbers)):
         return False
-    row = "".join(chosen.line(1 + index % n_skills, text) for index, text in enumerate(chosen.texts))
-    return len(tokenize(row)) == target * len(chosen.texts)
+    row = "".join(form.line(1 + index % n_skills, text) for index, text in enumerate(form.texts))
+    return len(tokenize(row)) == target * len(form.texts)
 
 
 def line_codes(count: int, tokenize: Tokenize) -> list[str] | None:

@@ -42,7 +42,7 @@ class SkillParsed:
 
 @dataclass(frozen=True, slots=True)
 class BadLine:
-    """A line that is no skill. ``text`` is cut if the line is too long."""
+    """A line that is not a skill. ``text`` is cut if the line is too long."""
 
     problem: Problem
     text: str
@@ -55,8 +55,6 @@ Event: TypeAlias = SkillParsed | BadLine
 
 
 class Parser:
-    """Reads one answer in one format."""
-
     def __init__(self, format_: Format) -> None:
         self._format = format_
         self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
@@ -84,7 +82,7 @@ class Parser:
         self._feeds += 1
         return self._events(self._reader.read(self._decoder.decode(b"", final=True)) + self._reader.end())
 
-    def _events(self, results: list[_Found]) -> list[Event]:
+    def _events(self, results: list[_Parsed]) -> list[Event]:
         events: list[Event] = []
         for result in results:
             if isinstance(result, int):
@@ -100,7 +98,7 @@ class Parser:
 
 _Bad: TypeAlias = tuple[Problem, str, str]
 """Problem, text and reason of a `BadLine`."""
-_Found: TypeAlias = int | _Bad
+_Parsed: TypeAlias = int | _Bad
 """An index in ``skills.calls``, or an error."""
 
 
@@ -112,8 +110,8 @@ class _Lines:
         self._line = ""
         self._skipping = False
 
-    def read(self, text: str) -> list[_Found]:
-        results: list[_Found] = []
+    def read(self, text: str) -> list[_Parsed]:
+        results: list[_Parsed] = []
         start = 0
         while True:
             end = text.find(self._format.delimiter, start)
@@ -123,7 +121,7 @@ class _Lines:
             results += self._finish()
             start = end + len(self._format.delimiter)
 
-    def end(self) -> list[_Found]:
+    def end(self) -> list[_Parsed]:
         line = self._line.strip()
         text = "" if self._format.numbered and line.isdecimal() else _text(line, self._format)
         if line and text is not None:
@@ -132,7 +130,7 @@ class _Lines:
                 return [("incomplete", line, f"the answer ended where '{longer}' was still possible")]
         return self._finish()
 
-    def _collect(self, text: str, start: int, end: int) -> list[_Found]:
+    def _collect(self, text: str, start: int, end: int) -> list[_Parsed]:
         if self._skipping:
             return []
         self._line += text[start : min(end, start + self._limit + 1)]
@@ -141,7 +139,7 @@ class _Lines:
         cut, self._line, self._skipping = self._line[: self._limit], "", True
         return [("too-long", cut, f"more than {self._limit} characters without the end of a line")]
 
-    def _finish(self) -> list[_Found]:
+    def _finish(self) -> list[_Parsed]:
         line, self._line, self._skipping = self._line.strip(), "", False
         return [_look_up(line, self._format)] if line else []
 
@@ -156,8 +154,8 @@ class _Codes:
         self._code = ""
         self._skipping = self._after_code = False
 
-    def read(self, text: str) -> list[_Found]:
-        results: list[_Found] = []
+    def read(self, text: str) -> list[_Parsed]:
+        results: list[_Parsed] = []
         for char in text:
             if char.isspace():
                 if self._code:
@@ -167,7 +165,7 @@ class _Codes:
                 results += self._take(char)
         return results
 
-    def _take(self, char: str) -> list[_Found]:
+    def _take(self, char: str) -> list[_Parsed]:
         if self._after_code and self._apart:
             self._skipping = True
             return [("malformed", char, "codes should be apart")]
@@ -179,7 +177,7 @@ class _Codes:
         self._skipping = not self._after_code
         return [_look_up(code, self._format)]
 
-    def end(self) -> list[_Found]:
+    def end(self) -> list[_Parsed]:
         if not self._code:
             return []
         return [("incomplete", self._code, "the answer ended within a code")]
@@ -193,7 +191,7 @@ def _text(line: str, format_: Format) -> str | None:
     return normalise(text) if dot and number.isascii() and number.isdecimal() else None
 
 
-def _look_up(line: str, format_: Format) -> _Found:
+def _look_up(line: str, format_: Format) -> _Parsed:
     text = _text(line, format_)
     if text is None:
         return "malformed", line, "a number and a dot should come first"
@@ -209,10 +207,10 @@ def _explain(text: str, line: str, format_: Format) -> _Bad:
     head, *rest = fields
     skill = next((skill for skill in format_.skills.skills if labels.head(skill) == head), None)
     if skill is None:
-        return "unknown-skill", line, f"'{head}' is none of the skills"
-    for argument, given in zip(skill.arguments, rest, strict=False):
-        if given not in {labels.value(argument.vocabulary, value) for value in argument.values}:
-            return "bad-argument", line, f"'{given}' is no {argument.name} of {skill.name}"
+        return "unknown-skill", line, f"'{head}' is not one of the skills"
+    for argument, field in zip(skill.arguments, rest, strict=False):
+        if field not in {labels.value(argument.vocabulary, value) for value in argument.values}:
+            return "bad-argument", line, f"'{field}' is not a valid {argument.name} of {skill.name}"
     if len(rest) < len(skill.arguments):
         return "bad-argument", line, f"{skill.name} has {len(skill.arguments)} arguments, {len(rest)} are given"
     return "malformed", line, f"{skill.name} is not written as listed"

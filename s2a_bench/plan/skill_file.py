@@ -181,6 +181,6 @@ def _argument(text: str, vocabularies: Mapping[str, tuple[Value, ...]]) -> Argum
     vocabulary = vocabulary or name
     _identifier(name)
     if vocabulary not in vocabularies:
-        known = ", ".join(vocabularies) or "none is"
-        raise ValueError(f"the vocabulary '{vocabulary}' is not defined ({known})")
+        defined = ", ".join(vocabularies) or "none is"
+        raise ValueError(f"the vocabulary '{vocabulary}' is not defined ({defined})")
     return Argument(name, vocabulary, vocabularies[vocabulary])

@@ -43,7 +43,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class PlanShape:
-    """What is known of a plan before its first token."""
+    """The properties of a plan that are known before its first token."""
 
     n_skills: int
     tokens_per_skill: float

@@ -7,10 +7,10 @@ deviations
 
 with mu and v learned from the tokens before the window. If the largest z_h exceeds SURPRISE, the machine has slowed
 down: the plan's rate is learned anew from that window on, with a vague prior (plan CV FRESH_CV). If a slow plan's least
-z_h is below -SURPRISE, the rate has recovered and all tokens count again. Gaps shorter than expected are no change: it
+z_h is below -SURPRISE, the rate has recovered and all tokens count again. Gaps shorter than expected do not count: it
 would be risky to start on a few of them. This is the generalised likelihood ratio of a change in mean over a sliding
 window (Willsky and Jones, IEEE TAC 1976). sigma is that of *sums* of gaps: where slow tokens usually come in bursts, a
-burst is no change.
+burst is not a change.
 """
 
 from __future__ import annotations

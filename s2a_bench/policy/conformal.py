@@ -52,7 +52,7 @@ CAUTIONS: Final = (*GRID, math.inf)
 AT_ONCE: Final = 512
 """Plans decided at every lambda in one pass, limited by memory."""
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
-"""What epsilon bounds; see the module docstring."""
+"""The quantity that epsilon bounds; see the module docstring."""
 GUARANTEE: Final[Any] = option(
     "high-confidence",
     "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)",
@@ -100,7 +100,7 @@ class Calibration:
 
 
 def promise(calibrations: Mapping[str, Mapping[str, Any]], what: str, unit: str) -> str:
-    """Return the share of further ``unit`` (plural) that ``what`` lets stall, the greatest of named calibrations.
+    """Return the share of future ``unit`` (plural) that may stall under ``what``, by the weakest calibration.
 
     Calibrations are plain data; one whose scores are not exchangeable promises nothing, and the sentence says so.
     """
@@ -248,7 +248,7 @@ class TrackedPolicy:
     and whether the plan stalled. `follow` does the same for arrays of plans.
     """
 
-    made: Policy
+    base: Policy
     """The policy with its prior; its lambda does not matter."""
     tracker: Tracker
 
@@ -258,30 +258,30 @@ class TrackedPolicy:
 
     @property
     def policy(self) -> Policy:
-        return self.made.informed(caution=self.tracker.caution)
+        return self.base.informed(caution=self.tracker.caution)
 
     def learn(self, plan: Plans, *, stalled: bool) -> None:
-        self.tracker.learn(float(scores(self.made, plan)[0]), stalled=stalled)
+        self.tracker.learn(float(scores(self.base, plan)[0]), stalled=stalled)
 
     def follow(self, plans: Plans) -> tuple[Floats, Schedule]:
         """Decide plans one after another, learning from each; return each plan's lambda and the schedule.
 
         Blocks of plans are decided at every lambda in one pass; then lambda is chosen plan by plan.
         """
-        chosen, starts, durations = [], [], []
+        cautions, starts, durations = [], [], []
         count = plans.arrival_s.shape[1]
         for places in np.array_split(np.arange(count), -(-count // AT_ONCE)):
-            every = self.made.schedules(take(plans, places), CAUTIONS)
+            every = self.base.schedules(take(plans, places), CAUTIONS)
             stalls = stalled(every)
             ranks = np.empty(places.size, dtype=np.intp)
             for place, score in enumerate(_least(stalls)):
                 ranks[place] = CAUTIONS.index(self.tracker.caution)
                 self.tracker.learn(score, stalled=bool(stalls[ranks[place], place]))
-            chosen += [CAUTIONS[rank] for rank in ranks]
+            cautions += [CAUTIONS[rank] for rank in ranks]
             columns = np.arange(places.size)
             starts.append(every.start_s[:, ranks, columns])
             durations.append(every.duration_s[:, ranks, columns])
-        return np.array(chosen), Schedule(np.concatenate(starts, axis=1), np.concatenate(durations, axis=1))
+        return np.array(cautions), Schedule(np.concatenate(starts, axis=1), np.concatenate(durations, axis=1))
 
 
 def _least(stalls: NDArray[np.bool_]) -> list[float]:

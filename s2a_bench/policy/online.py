@@ -95,7 +95,7 @@ class _View:
     last_s: Floats
     mean_s: Floats
     variance: Floats
-    """Of the mean gap, relative to its square."""
+    """The variance of the mean gap, relative to its square."""
     next_in: Floats
     """Tokens until the next fragment."""
     unknown: Floats

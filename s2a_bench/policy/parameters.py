@@ -19,51 +19,51 @@ T = TypeVar("T")
 
 def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and the known ones."""
-    name, _, given = written.partition("?")
-    hints = get_type_hints(made_by, include_extras=True) if given and is_dataclass(made_by) else {}
-    types = {each.name: hints[each.name] for each in _parameters(made_by)} if given else {}
+    name, _, query = written.partition("?")
+    hints = get_type_hints(made_by, include_extras=True) if query and is_dataclass(made_by) else {}
+    types = {each.name: hints[each.name] for each in _parameters(made_by)} if query else {}
     rest = getattr(made_by, "passes_on", "")
-    known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
+    names = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
     values: dict[str, Any] = {}
     others = list[tuple[str, str]]()
-    for pair in given.split("&") if given else ():
+    for pair in query.split("&") if query else ():
         parameter, _, text = pair.partition("=")
         if parameter not in types and rest:
             others.append((parameter, text))
             continue
         if parameter not in types or parameter in values:
-            wrong = "is given twice" if parameter in values else "is no parameter"
+            wrong = "is given twice" if parameter in values else "is not a parameter"
             meant = "" if parameter in values else like(parameter, types)
-            raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}{meant}")
-        values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", known)
+            raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {names}{meant}")
+        values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", names)
     if others:
         values[rest] = tuple(others)
     try:
         return made_by(**values)
     except UsageError as error:
-        hint = f"; {known}" if given else ""
+        hint = f"; {names}" if query else ""
         raise UsageError(f"`{field}`: {name}: {error}{hint}") from error
 
 
 def canonical(name: str, policy: object) -> str:
     """Return the text of a policy or mode: parameters sorted by name, those at their default left out."""
-    given = {}
+    texts = {}
     for field in _parameters(type(policy)):
         value = getattr(policy, field.name)
         if value != field.default:
-            given[field.name] = f"{value:.12g}" if isinstance(value, float) else str(value)
-    pairs = "&".join(f"{parameter}={text}" for parameter, text in sorted(given.items()))
+            texts[field.name] = f"{value:.12g}" if isinstance(value, float) else str(value)
+    pairs = "&".join(f"{parameter}={text}" for parameter, text in sorted(texts.items()))
     return f"{name}?{pairs}" if pairs else name
 
 
-def _value(type_: Any, text: str, what: str, known: str) -> Any:
+def _value(type_: Any, text: str, what: str, names: str) -> Any:
     from pydantic import TypeAdapter, ValidationError
 
     try:
         return TypeAdapter(type_).validate_strings(text)
     except ValidationError as error:
         wrong = error.errors()[0]["msg"]
-        raise UsageError(f"{what}: {wrong[0].lower()}{wrong[1:]}; {known}") from error
+        raise UsageError(f"{what}: {wrong[0].lower()}{wrong[1:]}; {names}") from error
 
 
 def _parameters(made_by: Any) -> list[Field[Any]]:

@@ -124,7 +124,7 @@ class ActionClient(Protocol):
         """Return whether a whole server is matched now."""
 
     def other_dds(self) -> str:
-        """Return the DDS of a server that is there and cannot be spoken to, "" if there is none."""
+        """Return the DDS of a server that is present but incompatible, else ""."""
 
     def server_version(self) -> str | None:
         """Return the interface version whose type hash the server announces; None if it announces none.
@@ -168,7 +168,7 @@ class ServerGoal(Protocol):
 
     @property
     def size_bytes(self) -> int:
-        """How large its request is: the CDR, or where the middleware keeps none its texts and pixels."""
+        """Return the size of its request: the CDR, or its texts and pixels where the middleware keeps no CDR."""
 
     @property
     def cancel_requested(self) -> bool:
@@ -203,7 +203,7 @@ class ActionServer(Protocol):
     """Offers one action; cancels and results are served by a thread of its own."""
 
     version: str
-    """Of llama_msgs, as in `messages.VERSIONS`."""
+    """The version of llama_msgs, one of `messages.VERSIONS`."""
 
     def next_goal(self, timeout_s: float) -> ServerGoal | None:
         """Wait for the next goal, to accept or reject; None on timeout or after `interrupt`. One thread at a time."""
@@ -220,7 +220,7 @@ class ServiceClient(Protocol):
 
 
 SERVICE_QOS = QoS(depth=10)
-"""What ROS's services have."""
+"""The QoS of ROS's services."""
 
 
 class Middleware(Protocol):
@@ -257,7 +257,7 @@ class Middleware(Protocol):
         """
 
     def describe(self) -> dict[str, str | int]:
-        """Return what carries the messages: implementation, version, domain, configuration."""
+        """Return the facts of the middleware: implementation, version, domain, configuration."""
 
     def close(self) -> None:
         """Leave the domain at once, so that peers need not wait for the lease; may be called twice."""
@@ -265,13 +265,13 @@ class Middleware(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MeetingPlace:
-    """Where the nodes of a middleware meet, if they do not find each other; an option or parameter names it."""
+    """The meeting place of a middleware whose nodes do not find each other; an option or parameter names it."""
 
     option: str
     about: str
     """The option's help."""
     title: str
-    """What is there, in a sentence."""
+    """Its name in a sentence."""
     default: str
     check: Callable[[str], object]
     """Raises UsageError for a text that names no place."""
@@ -289,17 +289,17 @@ class MiddlewareKind:
     module: str
     """The top-level module without which it is not installed."""
     way_out: str
-    """What to do then, beside choosing another."""
+    """The advice for a middleware that is not installed, beside choosing another."""
     dds: str
-    """What carries its messages: an RMW or its own name; empty for the library of a sourced ROS 2, which has an RMW."""
+    """The carrier of its messages: an RMW or its own name; empty for the library of a sourced ROS 2, which has one."""
     meeting_place: MeetingPlace | None = None
     against_loss: str = ""
-    """What helps where messages are lost; empty if they are UDP datagrams, for which the DDS in use has an advice."""
+    """The advice for lost messages; empty for UDP datagrams, for which the DDS in use has one."""
     extra: str = ""
     """The extra of s2a-bench that installs it."""
     packages: tuple[str, ...] = ()
     checks: Mapping[str, str] = field(default_factory=dict)
-    """As of a `Transport`, and so are ``packages``."""
+    """The same as `Transport.checks`; ``packages`` too."""
     has_action: str = ""
     """``module:function`` that returns whether an action's type is built, where types come from a workspace."""
 
@@ -307,7 +307,7 @@ class MiddlewareKind:
         return self.dds or environ.get("RMW_IMPLEMENTATION") or config.DEFAULT_RMW
 
     def place_in(self, options: object) -> str:
-        """Return what options or parameters say about its meeting place; "" for nothing, or if it has none."""
+        """Return its meeting place as options or parameters name it; "" if they do not, or if it has none."""
         return str(getattr(options, self.meeting_place.option)) if self.meeting_place else ""
 
     def builds(self, action: str) -> bool:
@@ -334,20 +334,20 @@ def default_middleware(environ: Mapping[str, str]) -> str:
     return min(kinds, key=lambda name: bool(kinds[name].dds), default=next(iter(MIDDLEWARES)))
 
 
-def chosen(name: str = "") -> MiddlewareKind:
+def middleware_kind(name: str = "") -> MiddlewareKind:
     """Return the middleware of a name, `default_middleware` without; raises UsageError."""
     return MIDDLEWARES[name or default_middleware(os.environ)]
 
 
 def way_out(kind: MiddlewareKind) -> str:
-    """Return what to do where a middleware is not installed: also each other one that pip installs."""
+    """Return the way out where a middleware is not installed: also each other one that pip installs."""
     extras = {name: other.extra for name, other in MIDDLEWARES.loaded() if other != kind and other.extra}
     others = (f"--middleware {name} ({how_to_install(extra)})" for name, extra in extras.items())
     return ", or ".join((kind.way_out, *others))
 
 
 def loss_advice(dds: str) -> str:
-    """Return what the middleware that speaks like ``dds`` says against loss; "" for datagrams."""
+    """Return the advice against loss of the middleware that speaks like ``dds``; "" for datagrams."""
     return next((kind.against_loss for _, kind in MIDDLEWARES.loaded() if kind.dds == dds), "")
 
 

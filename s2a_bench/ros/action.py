@@ -79,11 +79,11 @@ FEEDBACK_QOS: Final = QoS(depth=1000)
 STATUS_QOS: Final = QoS(depth=1, latched=True)
 HOUSEKEEPING_NS: Final = 500_000_000
 WAITING_AT_MOST: Final = 1000
-"""So many requests for one goal's result are remembered; more are not answered."""
+"""The most requests for one goal's result that are remembered; more are not answered."""
 LISTED_ENDED: Final = 64
 """The status array lists all live goals and so many of the latest that ended."""
 FEEDBACK_ID: Final = slice(4, 20)
-"""Where feedback has its goal's id in CDR."""
+"""The bytes of the goal's id in the CDR of feedback."""
 STATUS_ENTRY: Final = struct.Struct("<16s3xiIb")
 """One GoalStatus in little-endian CDR: goal id, seconds, nanoseconds, status; the first goal id needs no padding."""
 
@@ -152,17 +152,17 @@ class Goals:
     def cancel(self, goal_id: bytes, stamp_ns: int) -> tuple[CancelCode, list[Goal]]:
         """Select the goals a cancel request means, make them CANCELING, and return them with the return code."""
         everything = goal_id == ALL_GOALS and not stamp_ns
-        chosen = [
+        goals = [
             goal
             for goal in self._live.values()
             if Status.CANCELING in NEXT[goal.status]
             and (everything or goal.id == goal_id or (stamp_ns and goal.stamp_ns <= stamp_ns))
         ]
-        if not (chosen or everything or stamp_ns):
+        if not (goals or everything or stamp_ns):
             return (CancelCode.GOAL_TERMINATED if self.find(goal_id) else CancelCode.UNKNOWN_GOAL_ID), []
-        for goal in chosen:
+        for goal in goals:
             goal.status = Status.CANCELING
-        return CancelCode.NONE, chosen
+        return CancelCode.NONE, goals
 
     def expire(self, at_ns: int) -> None:
         while self._ended:
@@ -172,7 +172,7 @@ class Goals:
             del self._ended[goal.id]
 
     def listed(self) -> list[Goal]:
-        """Return what the status array shows, in order of acceptance."""
+        """Return the goals that the status array shows, in order of acceptance."""
         latest = islice(reversed(self._ended.values()), LISTED_ENDED)
         return sorted((*self._live.values(), *latest), key=lambda goal: goal.stamp_ns)
 
@@ -203,7 +203,7 @@ class ClientAction:
         # Readers are announced in order: a server that knows the reply readers below knows the feedback reader too.
         feedback = node.subscription(prefix + "feedback", type_name + "_FeedbackMessage", READER_QOS, version, waiter)
         status = node.subscription(prefix + "status", STATUS_ARRAY, STATUS_QOS)
-        """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
+        """The status topic, which is not read: a goal's status comes with its result. ROS tools expect a subscriber."""
         send_goal, get_result, cancel_goal = _services(name, type_name, version)
         self._goals = node.client_end(send_goal, waiter)
         self._results = node.client_end(get_result, waiter)
@@ -234,7 +234,7 @@ class ClientAction:
         if version := ros.version_of(self._goals.hashed_type, announced):
             return version
         raise TransportError(
-            f"the server's {self._type} has type hash {announced}: its llama_msgs is none of {', '.join(ros.VERSIONS)}"
+            f"the server's {self._type} has type hash {announced}, not that of llama_msgs {', '.join(ros.VERSIONS)}"
         )
 
     def pack(self, goal: Any) -> bytearray:
@@ -489,12 +489,12 @@ class ServedAction(Generic[Caller]):
 
     def _answer_cancel(self, request: Any, caller: Caller) -> None:
         info = request.goal_info
-        code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.nanoseconds(info.stamp))
-        canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in chosen]
+        code, canceled = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.nanoseconds(info.stamp))
+        canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in canceled]
         reply_type = self._cancel.spec.reply_type
         response = ros.default(reply_type, self.version, return_code=int(code), goals_canceling=canceling)
         self._cancel.respond(self._cancel.pack(response), caller)
-        if chosen:
+        if canceled:
             self._publish_status()
 
 

@@ -26,9 +26,9 @@ TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 image, and no lost fragments at 1920x1080."""
 CYCLONE_URI = "CYCLONEDDS_URI"
 CYCLONE, RMW_CYCLONE, RMW_FAST = "cyclonedds", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"
-"""What carries messages: Cyclone DDS from PyPI, and RMWs of an installed ROS 2."""
+"""The carriers of messages: Cyclone DDS from PyPI, and RMWs of an installed ROS 2."""
 DEFAULT_RMW = RMW_FAST
-"""Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""
+"""The RMW of Humble and Jazzy if RMW_IMPLEMENTATION is not set."""
 LARGE_PICTURES = (
     f'<CycloneDDS><Domain id="any"><General>{TUNED_GENERAL}</General>{TUNED_INTERNAL}</Domain></CycloneDDS>'
 )
@@ -39,10 +39,10 @@ PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
 multicast alone, as Fast DDS does on a subnet, and starts later than that would never be met on loopback."""
 
 
-def domain_id(environ: Mapping[str, str], chosen: int | None = None) -> int:
-    """Return the chosen DDS domain, else that of ROS_DOMAIN_ID, else 0; raises UsageError for what is no domain."""
-    if chosen is not None:
-        return chosen
+def domain_id(environ: Mapping[str, str], option: int | None = None) -> int:
+    """Return the DDS domain of the option, else of ROS_DOMAIN_ID, else 0; raises UsageError for an invalid one."""
+    if option is not None:
+        return option
     text = environ.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or not 0 <= int(text) <= 232:  # noqa: PLR2004 - the last domain with valid ports
         raise UsageError(f"ROS_DOMAIN_ID: '{text}' is not a number from 0 to 232; unset it or choose one")
@@ -58,11 +58,11 @@ def discovery_range(environ: Mapping[str, str], default: str) -> str:
 
 
 def static_peers(environ: Mapping[str, str]) -> list[str]:
-    """Return the addresses of ROS_STATIC_PEERS; raises UsageError for what is none."""
+    """Return the addresses of ROS_STATIC_PEERS; raises UsageError for an invalid one."""
     peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not PEER.fullmatch(peer):
-            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is no host name or address; separate several with ';'")
+            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is not a host name or address; separate several with ';'")
     return peers
 
 
@@ -84,5 +84,6 @@ def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
         f'<CycloneDDS><Domain id="any"><General>{general}</General>'
         f"{TUNED_INTERNAL if tuning == 'tuned' else ''}"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+        # with a longer interval a ROS process in SUBNET mode that starts after us is not met for 40 s
         f"<SPDPInterval>1s</SPDPInterval>{PATIENT}<Peers>{listed}</Peers></Discovery></Domain></CycloneDDS>"
     )

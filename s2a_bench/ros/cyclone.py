@@ -45,7 +45,7 @@ class NodeAnnouncement:
     """One node of one participant and all its endpoints; callable from any thread."""
 
     def __init__(self, participant: DomainParticipant, node_name: str) -> None:
-        """Announce ``node_name`` (``/namespace/name``) without endpoints; raises UsageError for what is no name."""
+        """Announce ``node_name`` (``/namespace/name``) without endpoints; raises UsageError for an invalid name."""
         check_node_name(node_name)
         namespace, _, self._name = node_name.rpartition("/")
         self._namespace = namespace or "/"
@@ -72,8 +72,8 @@ class NodeAnnouncement:
 
 
 def _topic_qos(qos: QoS, type_name: str, version: str = DEFAULT_VERSION) -> Qos:
-    known = type_name in ros.typestore(version).fielddefs
-    return dds_qos(qos, f"typehash={type_hash(type_name, version)};" if known else UNTYPED)
+    has_definition = type_name in ros.typestore(version).fielddefs
+    return dds_qos(qos, f"typehash={type_hash(type_name, version)};" if has_definition else UNTYPED)
 
 
 class _CyclonePublisher(RawWriter):
@@ -110,10 +110,10 @@ _domains_lock = Lock()
 def _configure(domain_id: int, xml: str) -> None:
     """Configure a domain once per process; Cyclone takes no second configuration."""
     with _domains_lock:
-        known = _domains.get(domain_id)
-        if known is None:
+        joined = _domains.get(domain_id)
+        if joined is None:
             _domains[domain_id] = (Domain(domain_id, xml), xml)
-        elif known[1] != xml:
+        elif joined[1] != xml:
             raise TransportError(f"DDS domain {domain_id} is already configured otherwise in this process")
 
 
@@ -126,6 +126,7 @@ class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
         try:
             if self._xml is not None:
                 _configure(domain_id, self._xml)
+            # the USER_DATA of every ROS participant
             self._participant = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise TransportError(
@@ -190,4 +191,5 @@ class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
     def leave(self) -> None:
         participant = self._participant
         del self._participant  # with it goes what nothing else refers to
+        # without this ROS would list the node until its lease of 10 s ends
         participant._delete(participant._ref)  # noqa: SLF001 - __del__ may come seconds later

@@ -20,15 +20,7 @@ from typing import Any
 from uuid import UUID
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-from cyclonedds.core import (
-    DDSException,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds.core import DDSException, GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl import types as idl
@@ -47,7 +39,7 @@ from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
 WRITERS_AT_MOST = 4096
-"""So many changes among the writers of a domain are taken at once."""
+"""The most changes among the writers of a domain that are taken at once."""
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 
 
@@ -134,7 +126,7 @@ def dds_qos(qos: QoS, announced: str) -> Qos:
         *lasting,
         *mortal,
         Policy.WriterDataLifecycle(autodispose=False),
-        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.DataRepresentation(use_cdrv0_representation=True),  # ROS endpoints accept XCDR1 alone
         Policy.Userdata(announced.encode()),
     )
 
@@ -167,10 +159,10 @@ def is_described(endpoint: Any, type_name: str) -> bool:
 
 
 class _Endpoint:
-    def __init__(self, entity: Any, handles: Callable[[], list[int]], known: Callable[[int], Any]) -> None:
+    def __init__(self, entity: Any, handles: Callable[[], list[int]], read_peer: Callable[[int], Any]) -> None:
         self.entity = entity
         self._reference = entity._ref  # noqa: SLF001 - the handle ctypes needs
-        self._handles, self._known = handles, known
+        self._handles, self._read_peer = handles, read_peer
 
     def peers(self) -> list[int]:
         """Return the handles of matched peers; cyclonedds counts first, and fails where one more has come since."""
@@ -182,10 +174,10 @@ class _Endpoint:
         return len(self.peers())
 
     def endpoint(self, handle: int) -> Any:
-        """Return what is known of one matched peer, a DcpsEndpoint; None if it has left, even while this was read."""
+        """Return the description of one matched peer, a DcpsEndpoint; None if it has left, even during this call."""
         try:
             with _reading:
-                return self._known(handle)
+                return self._read_peer(handle)
         except Exception as error:
             if str(error).startswith("Callfunc"):  # a bare Exception, of cyclonedds' C extension
                 return None
@@ -243,7 +235,7 @@ class RawReader(_Endpoint):
                 return loan.view()
 
     def arrived(self) -> Iterator[memoryview]:
-        """Take what has arrived, `AT_ONCE` samples at most: a writer may send faster than we take."""
+        """Take the samples that have arrived, `AT_ONCE` at most: a writer may send faster than we take."""
         return islice(iter(self.take, None), AT_ONCE)
 
     def sender(self) -> int:
@@ -251,21 +243,21 @@ class RawReader(_Endpoint):
 
 
 def writers_of(participant: DomainParticipant) -> Callable[[], list[Any]]:
-    """Return what knows the writers of the domain; keep it, as Cyclone gives back no memory of a reader.
+    """Return a function that lists the writers of the domain; keep it, as Cyclone gives back no memory of a reader.
 
     Nor does it of a writer's QoS that was read: each change is taken once.
     """
     reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-    known: dict[UUID, Any] = {}
+    writers: dict[UUID, Any] = {}
 
     def read() -> list[Any]:
         with _reading:
             while changes := reader.take(WRITERS_AT_MOST):
                 for writer in changes:
-                    known.pop(writer.key, None)
+                    writers.pop(writer.key, None)
                     if writer.sample_info.instance_state & InstanceState.Alive:
-                        known[writer.key] = writer
-            return list(known.values())
+                        writers[writer.key] = writer
+            return list(writers.values())
 
     return read
 

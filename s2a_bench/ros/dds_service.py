@@ -99,15 +99,15 @@ class DdsServiceClient(_End):
 
     def __init__(self, participant: DomainParticipant, spec: ServiceSpec, waiter: DdsWaiter) -> None:
         super().__init__(participant, spec, waiter)
-        self._guid = self.writer.entity.get_instance_handle() % 2**64
+        self._guid = self.writer.entity.get_instance_handle() % 2**64  # as rmw_cyclonedds; any but 0 would do
         self._numbers = count(1)
         self._pending: dict[int, bytes] = {}
         self._lock = Lock()
 
     def call(self, packed: bytearray, key: bytes) -> None:
-        with self._lock:
+        with self._lock:  # any thread may call
             number = next(self._numbers)
-            self._pending[number] = key
+            self._pending[number] = key  # before it is sent: the reply may be there at once
             HEADER.pack_into(packed, HEADER_AT, self._guid, number)
             self.writer.send(packed)
 
@@ -131,7 +131,7 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
         self._clients: dict[int, tuple[str, str]] = {}
 
     def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
-        """Take what has arrived, a bounded number; of what is too short for a header, the header is zero."""
+        """Take the samples that have arrived, a bounded number; the header of one too short to have one is zero."""
         for packed in self.reader.arrived():
             header = HEADER.unpack_from(packed, HEADER_AT) if len(packed) >= self.body_at else (0, 0)
             yield packed, Caller(self.reader.sender(), header)

@@ -1,4 +1,4 @@
-"""How a robot, a camera or an ego joins a domain: parameters, of which some are declared by middlewares."""
+"""Parameters with which a robot, a camera or an ego joins a domain; middlewares declare some of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 from pydantic import Field
 
 from s2a_bench.errors import UsageError
-from s2a_bench.ros import MIDDLEWARES, Middleware, chosen, open_middleware
+from s2a_bench.ros import MIDDLEWARES, Middleware, middleware_kind, open_middleware
 from s2a_bench.text import none_of
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ else:
 
 @dataclass(frozen=True, slots=True)
 class RosParameters(PlaceParameters):
-    """How to join a domain, the defaults as of the ROS transport; a peer is waited for ``wait_s``."""
+    """Parameters for joining a domain, with the ROS transport's defaults; ``wait_s`` is the longest wait for a peer."""
 
     wait_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
 
@@ -45,8 +45,8 @@ class RosParameters(PlaceParameters):
             at.check(getattr(self, at.option))
 
     def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
-        """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""
-        place = chosen(self.middleware).place_in(self)
+        """Return the result of ``opened`` for a new node called ``name``; if it raises, the node leaves."""
+        place = middleware_kind(self.middleware).place_in(self)
         node = open_middleware(self.middleware, domain_id=self.domain_id, node_name=name, place=place)
         try:
             return opened(node)

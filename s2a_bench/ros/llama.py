@@ -10,7 +10,7 @@ from s2a_bench.ros.messages import DEFAULT_VERSION, default
 
 GENERATE_RESPONSE = "llama_msgs/action/GenerateResponse"
 DRY_SEQUENCE_BREAKERS = ("\\n", ":", '\\"",', '*"')
-"""What rosidl makes of the default ``["\\\\n", ":", "\\\\\\"", "*"]``; peers without other wishes send this."""
+"""The texts that rosidl makes of the default ``["\\\\n", ":", "\\\\\\"", "*"]``, as peers without other wishes send."""
 
 
 def sampling_config(version: str = DEFAULT_VERSION, /, **overrides: Any) -> Any:

@@ -154,9 +154,9 @@ def _types(version: str) -> tuple[Typestore, Defaults]:
     folders |= {"s2a_msgs": root / "s2a_msgs", "llama_msgs": root / "interfaces" / VERSIONS[version]}
     defaults: Defaults = {}
     for package, folder in folders.items():
-        definitions, given = read_package(folder, package)
+        definitions, package_defaults = read_package(folder, package)
         store.register(definitions)
-        defaults |= given
+        defaults |= package_defaults
     return store, defaults
 
 
@@ -173,13 +173,13 @@ def message(type_name: str, /, **fields: Any) -> Any:
 def default(type_name: str, version: str = DEFAULT_VERSION, /, **fields: Any) -> Any:
     """Build a message as ROS initialises it, the defaults of its interface file or zeros; ``fields`` replace them."""
     store, defaults = _types(version)
-    given = defaults.get(type_name, {}) | fields
+    values = defaults.get(type_name, {}) | fields
     for name, description in store.fielddefs[type_name][1]:
-        if name not in given:
-            given[name] = _zero(description, version)
-        elif isinstance(given[name], Iterable) and not isinstance(given[name], str):
-            given[name] = _sequence(description, given[name])
-    return store.types[type_name](**given)
+        if name not in values:
+            values[name] = _zero(description, version)
+        elif isinstance(values[name], Iterable) and not isinstance(values[name], str):
+            values[name] = _sequence(description, values[name])
+    return store.types[type_name](**values)
 
 
 def _zero(description: Any, version: str) -> Any:
@@ -232,7 +232,7 @@ def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION, *, pad
     size = serialised_bytes(value, type_name, version)
     padding = -size % 4 if padded else 0
     buffer = bytearray(size + padding)
-    buffer[1], buffer[3] = 1, padding
+    buffer[1], buffer[3] = 1, padding  # ROS ignores the count of padding; Cyclone writes it
     store.get_msgdef(type_name).serialize_cdr_le(memoryview(buffer)[CDR_HEADER:], 0, value, store)
     return buffer
 
@@ -248,7 +248,7 @@ def deserialise(cdr: memoryview, type_name: str, version: str = DEFAULT_VERSION)
     try:
         return typestore(version).deserialize_cdr(cdr, type_name)
     except Exception as error:  # rosbags' generated code raises whatever its parsing runs into
-        raise TransportError(f"received bytes that are no {type_name}: {error}") from error
+        raise TransportError(f"received bytes that are not a {type_name}: {error}") from error
 
 
 int64_array = partial(np.fromiter, dtype=np.int64)
@@ -296,7 +296,7 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
     refuse_depth(encoding)
     channels = CHANNELS.get(encoding)
     if channels is None:
-        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is none of {', '.join(CHANNELS)}")
+        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is not one of {', '.join(CHANNELS)}")
     if not (image.width and image.height):
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding[:SHOWN]} is empty")
     height = image.height * 3 // 2 if encoding in CHROMA_BELOW else image.height

@@ -96,11 +96,11 @@ def value_message(value: Any) -> Any:
 
 
 def value_of(message: Any) -> Any:
-    """Read a ParameterValue; raises UsageError for a type that is none."""
+    """Read a ParameterValue; raises UsageError for an unknown type."""
     try:
         kind = Type(message.type)
     except ValueError:
-        raise UsageError(f"{message.type} is no type of a parameter") from None
+        raise UsageError(f"{message.type} is not a type of a parameter") from None
     value: Any = getattr(message, FIELDS[kind]) if kind else None
     return value.tolist() if hasattr(value, "tolist") else value
 
@@ -184,8 +184,8 @@ class Parameters:
         if not declared.live:
             raise UsageError(f"parameter {declared.name} is read-only: start the node with another value")
         value = value_of(parameter.value)
-        if (given := Type(parameter.value.type)) != (wanted := type_of(declared.value)):
-            raise UsageError(f"parameter {declared.name} is of type {wanted.name}, not {given.name}")
+        if (sent := Type(parameter.value.type)) != (wanted := type_of(declared.value)):
+            raise UsageError(f"parameter {declared.name} is of type {wanted.name}, not {sent.name}")
         return value
 
 

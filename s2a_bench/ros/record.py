@@ -36,11 +36,11 @@ PLAYED_QOS = Qos(
     _UNSET,
     avoid_ros_namespace_conventions=False,
 )
-"""How ``ros2 bag play`` offers every topic: ROS 2's default profile."""
+"""The QoS with which ``ros2 bag play`` offers every topic: ROS 2's default profile."""
 
 Cdr = bytes | bytearray | memoryview
 BACKLOG_BYTES = 256 * 2**20
-"""With so much CDR unwritten, `BagRecorder.write` writes it down itself rather than filling the memory."""
+"""The unwritten CDR from which on `BagRecorder.write` writes itself instead of filling the memory."""
 
 
 class BagRecorder(AbstractContextManager["BagRecorder"]):
@@ -122,7 +122,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         except OSError as error:
             raise self._failed(error) from error
         finally:
-            self._writer.abort()  # lets go of the file where closing did not get that far
+            self._writer.abort()  # closes the file where closing did not get that far
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish the file however the run ended: what was recorded up to an error is worth keeping, nothing is not."""

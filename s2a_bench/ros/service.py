@@ -19,7 +19,7 @@ from s2a_bench.ros.messages import DEFAULT_VERSION
 WAIT_SLICE_NS: Final = 500_000_000
 """A blocked wait returns to Python this often, so that Ctrl-C acts."""
 AT_ONCE: Final = 1000
-"""More than that is not taken before what has come is looked at."""
+"""The most messages that are taken before they are looked at."""
 READER_QOS: Final = QoS(depth=0)
 """Our readers keep all, whatever ROS does: history is local, and a burst overruns ROS's default of 10."""
 MATCH_POLL_S: Final = 0.01
@@ -32,7 +32,7 @@ WARNED_AT_MOST: Final = 100
 _log = logging.getLogger(__name__)
 Taken = TypeVar("Taken")
 Caller = TypeVar("Caller")
-"""What a middleware keeps of a request to address its reply."""
+"""The data with which a middleware addresses the reply to a request."""
 
 
 class Waits(Protocol):
@@ -59,7 +59,7 @@ def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[
 
 
 def awaited(take: Callable[[], Taken], waiter: Waits, timeout_s: float) -> Taken | None:
-    """Return what ``take`` finds, as soon as it finds something; None after the time, or an interrupt."""
+    """Return the result of ``take`` as soon as it has one; None after the time, or an interrupt."""
     deadline_ns = now_ns() + int(timeout_s * 1e9)
     while not waiter.interrupted:
         if (taken := take()) is not None or not waiter.wait_until(deadline_ns):
@@ -87,7 +87,7 @@ class ServiceSpec:
 class End(Protocol):
     spec: ServiceSpec
     body_at: int
-    """Where bodies begin in the CDR."""
+    """The offset of bodies in the CDR."""
 
     @property
     def hashed_type(self) -> str:
@@ -97,7 +97,7 @@ class End(Protocol):
     def pack(self, body: Any, /) -> bytearray: ...
 
     def unpack(self, packed: memoryview, /) -> Any:
-        """Deserialise what the other side sent; raises TransportError."""
+        """Deserialise a message of the other side; raises TransportError."""
 
 
 class ServiceEnd(End, Protocol[Caller]):
@@ -111,7 +111,7 @@ class ServiceEnd(End, Protocol[Caller]):
         return True
 
     def drop(self, caller: Caller, /) -> None:  # noqa: ARG002 - for ends that keep them
-        """Let go of a request, which may have been answered."""
+        """Release a request, which may have been answered."""
         return
 
     def client(self, caller: Caller, /) -> tuple[str, str]:  # noqa: ARG002 - for ends that know
@@ -144,7 +144,7 @@ class Source(Subscription, Protocol):
     """A subscription without a thread that waits for it."""
 
     def arrived(self) -> Iterable[memoryview]:
-        """Take what has arrived, `AT_ONCE` at most."""
+        """Take the messages that have arrived, `AT_ONCE` at most."""
 
     def announced(self) -> int:
         """Count the publishers, those of other versions too."""
@@ -196,11 +196,11 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         self._once = LogOnce(_log)
         self._servers: list[Any] = []
         self._closed = False
-        atexit.register(self.close)
+        atexit.register(self.close)  # a node that does not leave is seen until its lease ends
 
     @abstractmethod
     def waiter(self) -> Waiter:
-        """Return what waits for the endpoints that are made with it."""
+        """Return an object that waits for the endpoints that are made with it."""
 
     @abstractmethod
     def publisher(self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION) -> Publisher: ...
@@ -245,11 +245,11 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         """Answer one request, unless its client has left; what cannot be answered is dropped."""
         try:
             if len(packed) <= service.body_at:
-                raise TransportError(f"{len(packed)} bytes are no request")
+                raise TransportError(f"{len(packed)} bytes are not a request")
             response = service.pack(answer(service.unpack(packed)))
             if service.reaches(caller):
                 service.respond(response, caller)
-        except Exception as error:  # noqa: BLE001 - a bad request is no reason to stop
+        except Exception as error:  # noqa: BLE001 - the server survives a bad request
             kind = f"{name} {type(error).__name__}"  # not its text, which a client can vary each time
             self._once.warning(kind, "%s: dropped a request: %s", name, str(error)[:200])
 

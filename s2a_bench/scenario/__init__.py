@@ -32,7 +32,7 @@ class State:
     speed_mps: Floats
     """0 or more."""
     lateral_m: Floats
-    """From the middle of the starting lane, to the left."""
+    """The distance from the middle of the starting lane, to the left."""
 
     def keep(self, columns: NDArray[np.int64]) -> State:
         return State(self.position_m[:, columns], self.speed_mps[:, columns], self.lateral_m[:, columns])
@@ -50,7 +50,7 @@ class Simulator(Protocol):
     """A world of three cars; its parameters, if any, are the fields of a dataclass, all with defaults."""
 
     name: ClassVar[str]
-    """As in SIMULATORS."""
+    """The key in SIMULATORS."""
     real: ClassVar[bool]
     """Whether it has physics of its own, so that cars follow a command with an error; else they follow exactly."""
     steers: ClassVar[bool]

@@ -36,11 +36,11 @@ class Embedded(Simulator):
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle
         free = extras.require("highway_env.vehicle.kinematics", "ccrb").Vehicle
-        made_of = extras.require("highway_env.road.road", "ccrb")
-        straight = made_of.RoadNetwork.straight_road_network
+        roads = extras.require("highway_env.road.road", "ccrb")
+        straight = roads.RoadNetwork.straight_road_network
         network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
         # Fixed and unused; without it highway-env creates a randomly seeded one.
-        road = made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
+        road = roads.Road(network, np_random=np.random.RandomState(0), record_history=False)
         self._cars = {}
         for car in (LEAD, EGO, REAR):
             kind = controlled if car == EGO else free

@@ -33,7 +33,7 @@ COMMANDS: Final = {
 PICTURES: Final = {"native": "/carla/ego/front/image", "bridge": "/carla/ego_vehicle/rgb_front/image"}
 NAME: Final = f"^{ABSOLUTE.pattern}$"
 FULL_THROTTLE_MPS2, FULL_BRAKE_MPS2, ROLLING_MPS2, AIR_PER_M, REST_MPS = 4.0, 9.0, 0.1, 0.0003, 0.1
-"""Of no car in particular: what a car does instead is its error. Slower than the last, it is held by the brake."""
+"""Values of no particular car: a car's deviation is its error. Below the last, the brake holds it."""
 
 
 @dataclass(frozen=True, slots=True)

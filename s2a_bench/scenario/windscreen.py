@@ -83,5 +83,5 @@ def _fill(picture: Pixels, colour: tuple[int, ...], ahead: object, across: objec
         height, width = picture.shape[:2]
         scale = width / 2 / tan(radians(VIEW_DEG / 2)) / np.maximum(x, NEAR_M)
         corners = np.stack([width / 2 - y * scale, height / 2 + (HEIGHT_M - z) * scale], axis=1)
-        outline = cv2.convexHull(np.rint(corners * 16).astype(np.int32))
+        outline = cv2.convexHull(np.rint(corners * 16).astype(np.int32))  # in 1/16 pixels, as shift=4 says
         cv2.fillConvexPoly(picture, outline, colour, cv2.LINE_AA, shift=4)

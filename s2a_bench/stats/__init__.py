@@ -63,7 +63,7 @@ def summarise(values: Floats | Sequence[float]) -> Summary:
 
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
-        raise ValueError("there is no summary of no values")
+        raise ValueError("a summary needs at least one value")
     median, p90, p99 = np.percentile(array, (50, 90, 99))
     sd = float(array.std(ddof=1)) if array.size > 1 else None
     return Summary(array.size, float(median), float(array.mean()), sd, float(p90), float(p99))

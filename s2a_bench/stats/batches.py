@@ -116,20 +116,20 @@ class LaunchValues:
         n = len(self.batches)
         return rng.multinomial(n, [1 / n] * n, size=_RESAMPLES)
 
-    def replicate(self, name: str, drawn: NDArray[np.int64]) -> Floats:
+    def replicate(self, name: str, weights: NDArray[np.int64]) -> Floats:
         quantile = STATISTICS[name]
-        sizes = drawn @ np.array([len(batch) for batch in self.batches])
+        sizes = weights @ np.array([len(batch) for batch in self.batches])
         if quantile is None:
             sums = np.array([batch.sum() for batch in self.batches])
-            return np.asarray(drawn @ sums / sizes)
+            return np.asarray(weights @ sums / sizes)
         window, counts = self._window(quantile)
 
         def ranked(ranks: Floats) -> Floats:
             """Return the value of a rank, from 0, in every resample, by bisection."""
-            low, high = np.zeros(len(drawn), dtype=np.int64), np.full(len(drawn), len(window) - 1)
+            low, high = np.zeros(len(weights), dtype=np.int64), np.full(len(weights), len(window) - 1)
             while (low < high).any():
                 middle = (low + high) // 2
-                reached = (counts[middle] * drawn).sum(axis=1) > ranks
+                reached = (counts[middle] * weights).sum(axis=1) > ranks
                 low, high = np.where(reached, low, middle + 1), np.where(reached, middle, high)
             return window[low]
 

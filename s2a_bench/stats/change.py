@@ -113,7 +113,7 @@ def change_between(
     draws = [side[0].draw(rng) if len(side) == 1 else None for side in launches]
     if paired:
         draws[1] = draws[0]
-    below, above = (_Side.of(side, statistic, drawn, exact) for side, drawn in zip(launches, draws, strict=True))
+    below, above = (_Side.of(side, statistic, each, exact) for side, each in zip(launches, draws, strict=True))
     test = plain = _Test.of(below, above, paired)
     ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
     logarithmic = below.positive and above.positive
@@ -191,11 +191,11 @@ class _Side:
 
     @classmethod
     def of(
-        cls, launches: Sequence[LaunchValues], statistic: str, drawn: NDArray[np.int64] | None, exact: bool
+        cls, launches: Sequence[LaunchValues], statistic: str, draws: NDArray[np.int64] | None, exact: bool
     ) -> _Side:
         first = launches[0]
         points = np.array([launch.statistic(statistic) for launch in launches])
-        copies = first.replicate(statistic, drawn) if drawn is not None and first.allows(statistic) else None
+        copies = first.replicate(statistic, draws) if draws is not None and first.allows(statistic) else None
         return cls(points, copies, first.levels, exact)
 
     @property
@@ -261,13 +261,13 @@ class _Test:
         sides = [above.less(below)] if paired else [below, above]
         dependent = any(side.dependent for side in sides)
         shift = above.mean - below.mean
-        known = [variance for side in sides if (variance := side.variance) is not None]
-        if len(known) < len(sides):
+        variances = [variance for side in sides if (variance := side.variance) is not None]
+        if len(variances) < len(sides):
             return cls(Ratio(shift, None, None), None, dependent)
-        total = sum(variance for variance, _ in known)
+        total = sum(variance for variance, _ in variances)
         if total == 0:  # no variance: every difference is certain
             return cls(Ratio(shift, shift, shift), 0.0 if shift else 1.0, dependent)
-        freedom = total**2 / sum(variance**2 / df for variance, df in known)
+        freedom = total**2 / sum(variance**2 / df for variance, df in variances)
         error = math.sqrt(total)
         reach = float(special.stdtrit(freedom, (1 + CONFIDENCE) / 2)) * error
         p = float(2 * special.stdtr(freedom, -abs(shift) / error))

@@ -35,7 +35,7 @@ class Line:
     off: float
     spread: float | None = None
     covariance: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of fixed and fixed, fixed and slope, slope and slope."""
+    """The covariances of fixed and fixed, fixed and slope, slope and slope."""
 
     def at(self, x: float) -> float:
         return self.fixed.value + self.slope.value * x

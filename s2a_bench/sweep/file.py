@@ -42,7 +42,7 @@ def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int
     """
     for repeat in range(1, repeats + 1):
         order = list(items)
-        Random(f"{seed}/{repeat}").shuffle(order)  # noqa: S311 - an order, no secret
+        Random(f"{seed}/{repeat}").shuffle(order)  # noqa: S311 - an order, not a secret
         for item in order:
             yield repeat, item
 
@@ -52,15 +52,15 @@ def _listed(value: Any) -> list[Any]:
 
 
 BOARD = "board"
-"""The one key that is no flag: the machine that a cell needs."""
+"""The one key that is not a flag: the machine that a cell needs."""
 Axis = Annotated[list[Any], Field(min_length=1)]
 RESERVED = {
     "seed": "the seed is a key at the top of the file; every repeat derives its own from it",
     "output": "--output of 's2a-bench sweep' names the folder of all cells",
     "json": "the sweep has --json itself",
     "data-only": "cells always keep data only",
-    "help": "it is no setting",
-    "help-all": "it is no setting",
+    "help": "it is not a setting",
+    "help-all": "it is not a setting",
 }
 """Flags that a sweep sets itself -> what to do instead."""
 MOST_CELLS = 100_000
@@ -141,7 +141,7 @@ def _check_excludes(path: Path, excluded: list[dict[str, Any]], axes: dict[str, 
     for pattern in excluded:
         for key, value in pattern.items():
             if key not in axes:
-                raise UsageError(f"{path}: exclude.{key}: it is no axis{like(key, axes)}")
+                raise UsageError(f"{path}: exclude.{key}: it is not an axis{like(key, axes)}")
             for each in _listed(value):
                 if each not in axes[key]:
-                    raise UsageError(f"{path}: exclude.{key}: {each!r} is no value of that axis")
+                    raise UsageError(f"{path}: exclude.{key}: {each!r} is not a value of that axis")

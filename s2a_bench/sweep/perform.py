@@ -58,7 +58,7 @@ def run_folder(folder: Path) -> Path | None:
 def _inside(argv: list[str], entry: str) -> str:
     """Run the command in this process without output; return its error."""
     run: Any = resolve_name(entry)
-    given = sys.argv
+    arguments = sys.argv
     sys.argv = ["s2a-bench", *argv]  # for the run's manifest
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
@@ -68,7 +68,7 @@ def _inside(argv: list[str], entry: str) -> str:
     except Exception as error:  # noqa: BLE001 - it is the cell's error, and the other cells run
         return f"{type(error).__name__}: {error}"
     finally:
-        sys.argv = given
+        sys.argv = arguments
     return ""
 
 
@@ -167,7 +167,7 @@ class RayWorkers(CellWorkers):
         except self._ray.exceptions.RayError as error:
             return Outcome(f"Ray gave up: {str(error).splitlines()[0]}", 0.0, manifests.utc_now(), collect())
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
-            archive.extractall(folder, filter="data")
+            archive.extractall(folder, filter="data")  # it refuses members that lead out of the folder
         return outcome
 
     def __exit__(self, *_: object) -> None:

@@ -1,4 +1,4 @@
-"""From a sweep file to cells: each setting as a command line, in the order in which they run."""
+"""Turns a sweep file into cells: each setting as a command line, in the order in which they run."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def plan_sweep(file: SweepFile, command: SweepCommand, boards: Collection[str] |
     settings = list(enumerate(file.settings, 1))
     for _, setting in settings:
         _check_keys(file, command, setting)
-    chosen = [(number, each) for number, each in settings if boards is None or each.get(BOARD, "") in {"", *boards}]
-    if not chosen:
+    selected = [(number, each) for number, each in settings if boards is None or each.get(BOARD, "") in {"", *boards}]
+    if not selected:
         wanted = ", ".join(dict.fromkeys(str(setting[BOARD]) for _, setting in settings))
         raise UsageError(f"`board`: {file.path} has cells for {wanted} only; name one of them, or use `ray`")
     cells = []
-    for repeat, (number, setting) in rounds(chosen, file.repeats, file.seed):
+    for repeat, (number, setting) in rounds(selected, file.repeats, file.seed):
         argv = _argv(file, command, setting, file.seed + repeat - 1)
         try:
             virtual = command.check(argv[1:])
@@ -68,9 +68,9 @@ def _check_keys(file: SweepFile, command: SweepCommand, setting: Setting) -> Non
             continue
         if key not in command.flags:
             shown = {name for name, kind in command.flags.items() if kind != "hidden"}
-            known = sorted({*shown, BOARD}.difference(RESERVED))
-            hint = like(key, known) or f"; it has {', '.join(known)}"
-            raise UsageError(f"{file.path}: '{key}' is no flag of s2a-bench {command.name}{hint}")
+            keys = sorted({*shown, BOARD}.difference(RESERVED))
+            hint = like(key, keys) or f"; it has {', '.join(keys)}"
+            raise UsageError(f"{file.path}: '{key}' is not a flag of s2a-bench {command.name}{hint}")
         if command.flags[key] in {"switch", "toggle"}:
             if not isinstance(value, bool):
                 raise UsageError(f"{file.path}: {key}: {value!r} should be true or false")

@@ -41,7 +41,7 @@ class SimulatorSuite(FrameSourceSuite):
 
     @classmethod
     def outside(cls) -> object:
-        """Return what it may change outside of itself, as settings of its server; the default: the environment."""
+        """Return the state outside of itself that it may change, as settings of its server; here the environment."""
         return {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
 
     @classmethod

@@ -128,7 +128,7 @@ class TransportSuite:
     """Run by every transport and variant. Name the pipeline, or override `wiring`; set the limits of its protocol."""
 
     name: ClassVar[str]
-    """As in ``--transport``: the transport, perhaps a variant, perhaps options."""
+    """The name in ``--transport``: the transport, perhaps a variant, perhaps options."""
     carries_id_and_limit = True
     carries: ClassVar[frozenset[str]] = frozenset({"grammar", "seed"})
     """The further fields of a request that reach the handler."""
@@ -139,7 +139,7 @@ class TransportSuite:
     burst = 1000
     """Tokens or actions of a long answer."""
     failure = "the engine has had enough"
-    """What a client says of an engine that fails with these words."""
+    """The message of a client whose engine fails with these words."""
 
     @pytest.fixture
     def wiring(self) -> Wiring[Any]:
@@ -299,7 +299,7 @@ class TransportSuite:
         assert trace.facts["had_arrived"] == 1
 
     def test_inference_begins_when_the_engine_is_free(self, connect: Connect, wiring: Wiring[Any]) -> None:
-        """Not in the queue or before, by the marks and by what a policy server reports."""
+        """Inference begins neither in the queue nor before, by the marks and by what a policy server reports."""
         if wiring.black_box:
             pytest.skip("a black box sends no marks")
         recording, busy = self.handler(wiring, ["x", "y"]), Event()

@@ -49,7 +49,7 @@ Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
 
 
 def payload_order(payload: str) -> int:
-    """Return the place of a payload in tables; what is none of `PAYLOADS` comes last."""
+    """Return the place of a payload in tables; unknown payloads come last."""
     return PAYLOADS.index(payload) if payload in PAYLOADS else len(PAYLOADS)
 
 
@@ -134,7 +134,7 @@ class Client(Protocol):
         """
 
     def describe(self) -> dict[str, str]:
-        """Return what the manifest records of the client beside its wiring."""
+        """Return the manifest's facts about the client beside its wiring."""
         return {}
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class Server(Protocol):
     """The address for clients of the same transport, known once the server exists."""
 
     def describe(self) -> dict[str, str | int]:
-        """Return what the manifest records of the server."""
+        """Return the manifest's facts about the server."""
 
     def serve(self) -> None:
         """Serve until `stop` is called from another thread or a signal handler."""
@@ -202,6 +202,7 @@ class Choice(Generic[O]):
     options: O
     variant: str = ""
     mode: str = ""
+    """The request mode: request or stream."""
     engine: str = ""
     cameras: int = 1
     state: int = 0
@@ -209,7 +210,7 @@ class Choice(Generic[O]):
 
 @dataclass(frozen=True, slots=True)
 class Capabilities(Generic[O]):
-    """What a choice can carry; see the attributes of `Transport`."""
+    """The capabilities of a choice; see the attributes of `Transport`."""
 
     options: O
     """The options as they hold for the variant."""
@@ -219,7 +220,7 @@ class Capabilities(Generic[O]):
     facts: Sequence[Fact]
     """Facts that may come, from an external server too."""
     server: str = ""
-    """Which of the transport's servers serves the variant."""
+    """The name of the transport's server that serves the variant."""
     takes_task: bool = False
     """Whether the server is a policy, whose prompt is a short task, though its answers count as tokens."""
 
@@ -232,17 +233,17 @@ class Urls:
     examine: str = ""
     """``module:function`` for `doctor --url`, see `transport.risks`."""
     unpickles: str = ""
-    """Which of these servers run code that a client sends, as a sentence."""
+    """The servers of these that run code that a client sends, as a sentence."""
     cache_hits: str = ""
     """``module:function`` that returns counter -> cache hits that the server of a wiring has counted so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sleep:
-    """How long a server of others may sleep after each request, unless it was started with care."""
+    """The sleep of an external server after each request, which some of its start options avoid."""
 
     fact: Fact
-    """How long the client waited for an answer, in ms."""
+    """The time that the client waited for an answer, in ms."""
     ms: float
     advice: str
 
@@ -253,11 +254,11 @@ class Transport(Generic[O]):
     name: ClassVar[str] = ""
     options: type[O]
     variants: ClassVar[tuple[str, ...]] = ()
-    """What follows its name, as ``http/binary``; the first is the default."""
+    """The variants that may follow its name, as ``http/binary``; the first is the default."""
     payloads: ClassVar[tuple[str, ...]] = ()
     """Forms of a picture; the first is the default where raw is not possible. Empty where no picture is sent."""
     answer_kinds: ClassVar[tuple[str, ...]] = (TOKENS,)
-    """What answers can consist of: tokens, actions."""
+    """The kinds of answers: tokens, actions."""
     accepts_state: ClassVar[bool] = False
     stages: ClassVar[Mapping[str, str]] = {}
     """Stage -> group (one of `trace.GROUPS`), in addition to `trace.STAGES`."""
@@ -323,7 +324,7 @@ class Transport(Generic[O]):
         return False
 
     def against_loss(self, options: O) -> str:  # noqa: ARG002
-        """Return what to do where messages are lost."""
+        """Return the way out where messages are lost."""
         return "check the network"
 
     def addresses(self, options: O) -> Iterable[str]:  # noqa: ARG002
@@ -373,12 +374,12 @@ def paths() -> Iterator[str]:
 def named_by(url: str) -> str:
     """Return the transport of a URL's scheme, ``http`` without one; raises UsageError for an unknown scheme."""
     scheme, mark, _ = url.partition("://")
-    known = {scheme: name for name, each in TRANSPORTS.loaded() for scheme in each.urls.schemes}
-    if mark and scheme.lower() not in known:
+    by_scheme = {scheme: name for name, each in TRANSPORTS.loaded() for scheme in each.urls.schemes}
+    if mark and scheme.lower() not in by_scheme:
         raise UsageError(
-            f"`url`: no installed transport speaks {scheme}://, only {', '.join(f'{each}://' for each in known)}"
+            f"`url`: no installed transport speaks {scheme}://, only {', '.join(f'{each}://' for each in by_scheme)}"
         )
-    return known.get(scheme.lower(), "http")
+    return by_scheme.get(scheme.lower(), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:

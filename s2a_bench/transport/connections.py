@@ -56,7 +56,7 @@ class Connections:
 
     def stop(self) -> None:
         self._stopped = True
-        with suppress(OSError):
+        with suppress(OSError):  # wakes a blocked `accept`, which closing alone does not
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         for wire in list(self._wires):
@@ -73,10 +73,10 @@ class Connections:
             self._wires[wire] = thread
         try:
             thread.start()
-        except RuntimeError:
+        except RuntimeError:  # the limit of threads is reached
             self._close(wire)
             raise
-        if self._stopped:
+        if self._stopped:  # `stop` may have gone through the connections before this one was among them
             wire.read_no_more()
 
     def _handled(self, wire: Wire) -> None:
@@ -119,7 +119,7 @@ class Wire:
         if unsent:
             del unsent[:sent]
         else:
-            unsent += memoryview(data)[sent:]
+            unsent += memoryview(data)[sent:]  # a view: a slice of bytes would be a copy
 
     def flush(self, left_s: float) -> None:
         """Send the rest, and wait for the client up to this time; raises Disconnected."""
@@ -133,6 +133,7 @@ class Wire:
 
     def disconnected(self) -> bool:
         """Whether the client has hung up, even if some of its bytes are unread."""
+        # our own SHUT_RD raises POLLRDHUP too, so after `read_no_more` the poll says nothing
         return not self._stopping and bool(self._poll.poll(0))
 
     def linger(self) -> None:
@@ -165,5 +166,5 @@ def wait_at_most(connection: socket.socket, seconds: float) -> None:
 
 def timeval(seconds: float) -> bytes:
     """Return a time as options of sockets have it."""
-    whole = int(seconds)
+    whole = int(seconds)  # at least 1 us below: an option of zero would mean no limit
     return _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))

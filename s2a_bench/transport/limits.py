@@ -74,7 +74,7 @@ def text(name: str, value: Any, default: str = "") -> str:
     try:
         value.encode()
     except UnicodeEncodeError:
-        raise RequestFailed(f"{name} is no Unicode text: it has half a surrogate pair") from None
+        raise RequestFailed(f"{name} is not Unicode text: it has half a surrogate pair") from None
     return value
 
 

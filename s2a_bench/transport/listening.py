@@ -91,7 +91,7 @@ def is_loopback(host: str) -> bool:
     """Return True for localhost and an address of loopback; no name is resolved."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
+    except ValueError:  # a name
         return False
 
 
@@ -102,7 +102,7 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
     """
     host, port = split_address(address, scheme)
     bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of a server before are in TIME_WAIT
     try:
         bound.bind((host, int(port)))
         key = key_for(bound.getsockname()[0], options.api_key_env, no_auth=options.no_auth)
@@ -124,11 +124,11 @@ def cannot_bind(host: str, port: str, number: int | None, why: str | None) -> Po
 
 
 def check_url(url: str, schemes: Collection[str]) -> None:
-    """Raise ValueError, without a password, for a text that is no URL with one of the schemes."""
+    """Raise ValueError, without a password, for a text that is not a URL with one of the schemes."""
     try:
         address = urlsplit(url)
         valid = address.scheme in schemes and bool(address.hostname) and address.port != 0
-    except ValueError:
+    except ValueError:  # of a malformed port or IPv6 address
         valid = False
     if not valid:
         shown = re.sub(r"[^/]*@", "***@", url.partition("?")[0])

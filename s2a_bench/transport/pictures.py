@@ -82,12 +82,12 @@ def decoded(media_type: str, data: bytes | memoryview, trace: Trace, most_pixels
             check_pixels(width, height, most_pixels)
             encoding: Any = parameters["encoding"]
             if encoding not in RAW_BYTES:
-                raise ValueError(f"raw encoding '{encoding}' is none of {', '.join(RAW_BYTES)}")
+                raise ValueError(f"raw encoding '{encoding}' is not one of {', '.join(RAW_BYTES)}")
             pixels = np.frombuffer(data, np.uint8).reshape(height, width, RAW_BYTES[encoding])
             return rgb_of(Frame(-1, 0, width, height, encoding, pixels), trace)
-        rgb = decode_received(data)
+        rgb = decode_received(data)  # OpenCV's own limit of pixels bounds what this allocates
     except (ValueError, KeyError) as error:
-        raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are no such picture: {error}") from error
+        raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are not such a picture: {error}") from error
     check_pixels(rgb.shape[1], rgb.shape[0], most_pixels)
     trace.mark("image_decode")
     return Frame(-1, 0, rgb.shape[1], rgb.shape[0], "rgb8", rgb)

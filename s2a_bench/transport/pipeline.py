@@ -112,10 +112,10 @@ def pipelines(
     ``strict``, which `require_payload` refuses, else its default. A name without a variant stands for ``every`` variant
     that is measured by default, or for the first. ``of_engine`` are options of the engine that names may hold as well.
     """
-    given = {name: dict(values) for name, values in (options or {}).items()}
+    options_of = {name: dict(values) for name, values in (options or {}).items()}
     by_name: dict[str, Pipeline] = {}
     for text in names:
-        for pipeline in _standing_for(text, given, payloads, mode, engine, of_engine, strict=strict, every=every):
+        for pipeline in _standing_for(text, options_of, payloads, mode, engine, of_engine, strict=strict, every=every):
             by_name.setdefault(pipeline.name, pipeline)
     return list(by_name.values())
 
@@ -154,21 +154,21 @@ def _standing_for(
     strict: bool,
     every: bool,
 ) -> Iterator[Pipeline]:
-    name, chosen, written = _parse(text)
+    name, named_variant, written = _parse(text)
     transport = TRANSPORTS[name]
     flags = flags_of.get(transport.name, {})
-    given = {name: value for name, value in written.items() if name not in of_engine}
-    engine_options = tuple(sorted(written.items() - given.items()))
+    own = {name: value for name, value in written.items() if name not in of_engine}
+    engine_options = tuple(sorted(written.items() - own.items()))
     plain = _checked(transport.options, flags, transport.name)
-    options = _checked(transport.options, {**flags, **given}, transport.name)
+    options = _checked(transport.options, {**flags, **own}, transport.name)
     only = wanted[0] if strict and len(wanted) == 1 else ""
     measured = transport.measured(Choice(_filled(options, only), engine=engine))
-    variants = [chosen] if chosen else measured[: None if every else 1]
+    variants = [named_variant] if named_variant else measured[: None if every else 1]
     for variant in variants:
         if variant not in (transport.variants or ("",)):
-            known = ", ".join(transport.variants) or "none: it has no variants"
+            names = ", ".join(transport.variants) or "variants: it has none"
             meant = like(variant, transport.variants)
-            raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}{meant}")
+            raise UsageError(f"`transport`: '{variant}' is not one of {transport.name}'s {names}{meant}")
         can = transport.capabilities(Choice(options, variant, mode=mode))
         refused = wanted[:1] if strict and can.payloads else ()  # by `require_payload`
         payloads = [each for each in wanted if each in can.payloads] or refused or can.payloads[:1] or ("",)
@@ -183,9 +183,9 @@ def _standing_for(
 def _checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:
     for name in values:
         if name not in model.model_fields:
-            known = model.model_fields
+            fields = model.model_fields
             raise UsageError(
-                f"`transport`: {owner} has no option '{name}'; it has {', '.join(known)}{like(name, known)}"
+                f"`transport`: {owner} has no option '{name}'; it has {', '.join(fields)}{like(name, fields)}"
             )
     return model(**values)
 

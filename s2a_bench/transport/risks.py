@@ -26,19 +26,19 @@ ENCRYPTED: Final = frozenset({"https", "wss"})
 
 def examine(url: str) -> list[Finding]:
     """Return the findings about a URL; raises UsageError for an unknown scheme, MissingExtra."""
-    known = {scheme: each for _, each in TRANSPORTS.loaded() if each.urls.examine for scheme in each.urls.schemes}
+    by_scheme = {scheme: each for _, each in TRANSPORTS.loaded() if each.urls.examine for scheme in each.urls.schemes}
     try:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port or "PORT"
     except ValueError as error:
-        raise UsageError(f"`url`: that is no URL: {error}") from error
-    if not host or parts.scheme not in known:
-        schemes = ", ".join(f"{scheme}://" for scheme in known)
+        raise UsageError(f"`url`: that is not a URL: {error}") from error
+    if not host or parts.scheme not in by_scheme:
+        schemes = ", ".join(f"{scheme}://" for scheme in by_scheme)
         without_key = f"{parts.scheme}://{host}" if parts.scheme else url.rpartition("@")[2]
         raise UsageError(
             f"`url`: '{without_key}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
         )
-    transport, local = known[parts.scheme], is_local(host)
+    transport, local = by_scheme[parts.scheme], is_local(host)
     transport.check_machine()
     exposed = [] if local or parts.scheme in ENCRYPTED else ["not encrypted, so a key can be read on the way"]
     exposed += [transport.urls.unpickles] if transport.urls.unpickles else []

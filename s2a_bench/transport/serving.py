@@ -125,7 +125,7 @@ class Turns:
                 return
             self._running = following = self._waiting.popleft() if self._waiting else None
         if following is not None and following.ready is not None:
-            following.alive_ns = now_ns()
+            following.alive_ns = now_ns()  # else its wait would count as the silence of `silent_s`
             following.ready.set()
 
     @property
@@ -215,7 +215,7 @@ class Exchange:
         self.ends_ns = 0
         """Deadline of the answer on CLOCK_MONOTONIC; set when the request joins the queue."""
         self.held = ExitStack()
-        """What the request holds, its bytes in flight; released before `end`, which may wait."""
+        """The resources of the request, its bytes in flight; released before `end`, which may wait."""
 
     def sent_whole(self) -> None:
         """Mark an answer that is sent as a whole: the time of its later pieces is `inference` too."""
@@ -324,7 +324,7 @@ class Core:
             finally:
                 if turn is not None:
                     turn.leave()
-            exchange.held.close()
+            exchange.held.close()  # before `end`, which may wait for a slow client
             exchange.end()
         except Disconnected:
             return False

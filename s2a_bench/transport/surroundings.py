@@ -1,4 +1,4 @@
-"""What surrounds a run of requests, of installed packages alone: a network between its ends, another host's clock.
+"""The surroundings of a run of requests, from installed packages alone: a network between its ends, another clock.
 
 The options of each kind are fields of every configuration of requests. `Surroundings.of` makes of them an object with
 what a run is within; views show what each kind knows of a kept run, within it or not.
@@ -27,13 +27,13 @@ The argument is one of `machine.clocks.WALL_CLOCKS`, by which the server then bo
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """How far the stamps of a report may be off, once they are on this host's clock."""
+    """The error bounds of a report's stamps, once they are on this host's clock."""
 
     error_ns: int
-    """From the last byte packed to the first piece, either way."""
+    """The bound from the last byte packed to the first piece, in both directions."""
     early_ns: int
     late_ns: int
-    """From the reception of the frame to the last piece: how much earlier and later the true times may be."""
+    """How much earlier and later the true times may be, from the reception of the frame to the last piece."""
 
 
 class OtherClock(Protocol):
@@ -50,7 +50,7 @@ class OtherClock(Protocol):
 
 
 class Around:
-    """What surrounds one run while it lasts: nothing."""
+    """The surroundings of one run while it lasts: by default nothing."""
 
     def facts(self, say: Callable[[str], None]) -> Mapping[str, Any]:
         """Return entries of the manifest, before servers start; ``say`` what takes time."""
@@ -58,7 +58,7 @@ class Around:
         return {}
 
     def server_side(self) -> AbstractContextManager[None]:
-        """Return what servers are started within."""
+        """Return the context within which servers are started."""
         return nullcontext()
 
     def origin(self, origin: Provenance) -> Provenance:
@@ -86,18 +86,18 @@ class Surroundings:
 
     @classmethod
     def of(cls, config: Any, pipelines: Sequence[Pipeline]) -> Surroundings | None:
-        """Return what a configuration, which has ``options``, asks for; None: nothing.
+        """Return the surroundings that a configuration, which has ``options``, asks for; None: none.
 
         Raises UsageError, naming the field, for what a pipeline cannot have.
         """
         raise NotImplementedError
 
     def around(self) -> AbstractContextManager[Around]:
-        """Return what the thread that makes the requests enters, before a source of pictures is opened."""
+        """Return the context that the thread of the requests enters, before a source of pictures is opened."""
         return nullcontext(Around())
 
     def clock(self, exchange: Exchange, shared: dict[str, Any] | None) -> OtherClock | None:
-        """Return what puts the reports of a session's server on this host's clock.
+        """Return the object that puts the reports of a session's server on this host's clock.
 
         ``shared`` is what the sessions of a launch keep together; None: no exchange may be made beside the requests.
         """

@@ -1,4 +1,4 @@
-"""What passes between a client and a server of others, read from copies of the bytes that a tap passes on.
+"""Reads the exchanges of a client and an external server from copies of the bytes that a tap passes on.
 
 A transport declares its reader (`Transport.reader`), a subclass of `TapReader`: it finds where requests and answers
 begin and end. It does no I/O, keeps at most `MOST_BYTES` of one message, and may raise anything: the tap goes on.
@@ -12,20 +12,20 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 MOST_BYTES: Final = 64 << 20
-"""Of a message that is decoded."""
+"""The most bytes of a message that is decoded."""
 DECODED_BYTES: Final = 4 << 20
-"""Of an answer in one piece that is decoded."""
+"""The most bytes of an answer in one piece that is decoded."""
 MOST_WAITING: Final = 1000
 """Requests of a connection that wait for their answers."""
 MOST_KINDS: Final = 32
 OTHERS: Final = "others"
 """The kind of all requests after so many kinds."""
 MOST_PIECES: Final = 1 << 20
-"""Of an answer, which need not end."""
+"""The most pieces of an answer, which need not end."""
 LETTERS: Final = 100
-"""Of kinds of exchanges."""
+"""The most letters of an exchange's kind."""
 FAILED: Final = "an error in place of an answer"
-"""What an error becomes: what a server says may have a key or the robot's prompt in it."""
+"""The text of every error: a server's own may contain a key or the robot's prompt."""
 
 
 @dataclass(slots=True, eq=False)
@@ -37,19 +37,19 @@ class Seen:
 
     what: str
     request_ns: int
-    """First byte of the request arrived."""
+    """The first byte of the request arrived."""
     sent_ns: int = 0
-    """Its last byte was passed on."""
+    """The last byte of the request was passed on."""
     answer_ns: int = 0
-    """First byte of the answer arrived."""
+    """The first byte of the answer arrived."""
     end_ns: int = 0
-    """Its last byte was passed on."""
+    """The last byte of the answer was passed on."""
     up_bytes: int = 0
     down_bytes: int = 0
     pieces_ns: list[int] = field(default_factory=list)
     """When each token or partial action had been passed on; empty for an answer in one piece."""
     infer_ms: float | None = None
-    """What the server says of its inference."""
+    """The time of inference that the server reports."""
     chunk: tuple[int, int] | None = None
     """Actions of the answer, and numbers of each: (H, D)."""
     observation: Any = None
@@ -61,16 +61,16 @@ class TapReader:
     """Pairs the requests of one connection with its answers, in order; subclasses read `up` and `down`.
 
     A subclass calls `begin_request` at the first byte of a request and `end_request` at its last one, then
-    `begin_answer` and `end_answer`. What a server sends while no request waits, such as a greeting, is no answer.
+    `begin_answer` and `end_answer`. What a server sends while no request waits, such as a greeting, is not an answer.
     """
 
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        """Call ``report`` with each exchange; ``known`` are the kinds whose requests need not be decoded any more."""
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        """Call ``report`` with each exchange; ``kinds`` are the kinds whose requests need not be decoded any more."""
         self.report = report
         self.pings = 0
         self.from_ns = self.to_ns = 0
         """When the bytes that are read arrived, and when they had been passed on."""
-        self._known = known
+        self._kinds = kinds
         self._waiting = deque[Seen]()
 
     def passed(self, data: bytes, from_ns: int, to_ns: int, *, up: bool) -> None:
@@ -86,10 +86,10 @@ class TapReader:
 
     def fresh(self, seen: Seen) -> bool:
         """Whether a request is the first of its kind, whose content is wanted; beyond `MOST_KINDS` all are one kind."""
-        if seen.what not in self._known and len(self._known) >= MOST_KINDS:
+        if seen.what not in self._kinds and len(self._kinds) >= MOST_KINDS:
             seen.what = OTHERS
-        fresh = seen.what not in self._known
-        self._known.add(seen.what)
+        fresh = seen.what not in self._kinds
+        self._kinds.add(seen.what)
         return fresh
 
     def begin_request(self, what: str = "") -> Seen:
@@ -125,7 +125,7 @@ class TapReader:
         self.report(seen)
 
     def end(self) -> None:
-        """Tell of the requests that a connection ended without an answer to."""
+        """Report the requests that a connection ended without an answer to."""
         for seen in self._waiting:
             seen.error = seen.error or "the connection ended before the answer"
             self.report(seen)
@@ -163,7 +163,7 @@ class Incoming:
         next(self._parser)
 
     def feed(self, data: bytes) -> None:
-        if self._unwanted > len(data):
+        if self._unwanted > len(data):  # bytes that nothing reads are not copied
             self._unwanted -= len(data)
             return
         data, self._unwanted = data[self._unwanted :], 0
@@ -195,7 +195,7 @@ class Incoming:
             yield
 
     def _joined(self) -> bytes:
-        """Join what is there, without a copy if it came together."""
+        """Join the bytes that are there, without a copy if they came together."""
         if len(self._pieces) > 1:
             first, *others = self._pieces
             self._pieces, self._at = [b"".join((memoryview(first)[self._at :], *others))], 0
@@ -213,8 +213,8 @@ class Incoming:
 class ParsedTapReader(TapReader):
     """A reader whose directions are parsed by a generator each, `messages`."""
 
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(report, known)
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        super().__init__(report, kinds)
         self._up = Incoming(lambda incoming: self.messages(incoming, up=True))
         self._down = Incoming(lambda incoming: self.messages(incoming, up=False))
 
@@ -225,5 +225,4 @@ class ParsedTapReader(TapReader):
         self._down.feed(data)
 
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
-        """Read messages without end."""
         raise NotImplementedError

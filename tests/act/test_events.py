@@ -81,7 +81,7 @@ def test_a_skill_arrives_with_the_token_that_completes_it() -> None:
 def test_skills_before_a_malformed_line_are_begun_and_those_after_it_are_not() -> None:
     record = execute(["1. go_to(kitchen)\n", "2. fly(roof)\n", "3. pick(cup)\n"], 3)
     assert record.outcome == "invalid-line"
-    assert record.why == "line 2 (unknown-skill): 'fly' is none of the skills"
+    assert record.why == "line 2 (unknown-skill): 'fly' is not one of the skills"
     assert [str(skill.call) for skill in record.skills] == ["go_to(kitchen)"]
 
 

@@ -66,7 +66,7 @@ def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
     assert kind("arm?stiff=true", SkillKind) == Arm(stiff=True)
     assert isinstance(kind("arm", SkillKind).open_skills(load_skills("household")), CallableRobot)
     assert kind("arm?stiff=true", ActionKind).open_actions(3, 1).state() == (0, 0, 0)
-    with pytest.raises(UsageError, match="`robot`: arm: 'soft' is no parameter; its parameters are stiff"):
+    with pytest.raises(UsageError, match="`robot`: arm: 'soft' is not a parameter; its parameters are stiff"):
         kind("arm?soft=true", ActionKind)
     with pytest.raises(UsageError, match="`robot`: timed takes no actions; ros, call, arm do"):
         kind("timed", ActionKind)

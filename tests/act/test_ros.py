@@ -112,7 +112,7 @@ def test_a_robot_that_nobody_listens_to_is_no_robot(dds_domain: int) -> None:
         ("ros?type=Twist", "`robot`: ros: type = 'Twist': input should be 'JointTrajectory' or 'Float64MultiArray'"),
         ("ros?joints=a:b:a", "`robot`: ros: joints = 'a:b:a' names one twice"),
         ("ros?joints=a:b&type=Float64MultiArray", "Float64MultiArray has no names of joints"),
-        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, rclpy, zenoh"),
+        ("ros?middleware=opendds", "middleware = 'opendds' is not one of cyclonedds, rclpy, zenoh"),
         ("ros?domain_id=300", "`robot`: ros: domain_id = '300': input should be less than or equal to 232"),
     ],
 )

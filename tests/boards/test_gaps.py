@@ -134,9 +134,9 @@ def test_a_recording_in_order_is_exactly_what_was_recorded(trace: list[float], t
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({}, "family: None is none of constant, lognormal, markov"),
-        ({"family": ["lognormal"]}, r"family: \['lognormal'\] is none of"),
-        ({"family": "normal"}, "family: 'normal' is none of"),
+        ({}, "family: None is not one of constant, lognormal, markov"),
+        ({"family": ["lognormal"]}, r"family: \['lognormal'\] is not one of"),
+        ({"family": "normal"}, "family: 'normal' is not one of"),
         ({"family": "lognormal"}, "cv: is missing"),
         ({"family": "lognormal", "cv": 0.2, "sd": 1}, "sd: lognormal gaps have no such key; they have cv"),
         ({"family": "constant", "cv": 0}, "cv: constant gaps have no such key; they have none"),

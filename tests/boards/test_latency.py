@@ -67,10 +67,10 @@ def test_a_csv_file_is_played_in_its_order(text: str, expected: list[int], tmp_p
         ("a,b\n1,2\n", "has the columns a, b; it needs observation_ns and received_ns, or one of latency_ns"),
         ("", "has the columns none"),
         ("latency_ns\n", "has no rows"),
-        ("latency_ms\n1\nsoon\n", "line 3: the latency is no number"),
+        ("latency_ms\n1\nsoon\n", "line 3: the latency is not a number"),
         ("latency_ms\n-1\n", "line 2: a latency of -1e+06 ns should be between 0 and an hour"),
         ("latency_ms\nnan\n", "line 2: a latency of nan ns"),
-        ("observation_ns,received_ns\n5\n", "line 2: the latency is no number"),
+        ("observation_ns,received_ns\n5\n", "line 2: the latency is not a number"),
     ],
 )
 def test_a_csv_file_that_is_wrong_is_named_with_its_line(text: str, message: str, tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_a_csv_file_that_is_wrong_is_named_with_its_line(text: str, message: str
     [
         ("-1", "`latency`: -1 should be between 0 and 3.6e+06 ms"),
         ("nan", "should be between 0"),
-        ("normal:mean_ms=4", "`latency`: 'normal' is none of the families constant, lognormal"),
+        ("normal:mean_ms=4", "`latency`: 'normal' is not one of the families constant, lognormal"),
         ("lognormal:cv=.5", "mean_ms should be above 0"),
         ("lognormal:mean_ms=80,cv=big", "'cv=big' should be key=number"),
         ("none.csv", "cannot read none.csv"),

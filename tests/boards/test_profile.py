@@ -140,7 +140,7 @@ def test_what_is_no_toml_and_what_cannot_be_read_say_so(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"`profile`: cannot read .*x\.toml: "):
         read_profile(path)
     path.write_text("title = ")
-    with pytest.raises(UsageError, match=r"profile .*x\.toml: no TOML"):
+    with pytest.raises(UsageError, match=r"profile .*x\.toml: not TOML"):
         read_profile(path)
 
 

@@ -128,7 +128,7 @@ def test_a_value_out_of_bounds_is_one_line_that_names_the_flag(arguments: list[s
 def test_the_library_names_the_field() -> None:
     with pytest.raises(UsageError, match=r"^`t_nom_s`: -1 should be greater than 0$"):
         Asked(t_nom_s=-1)
-    with pytest.raises(UsageError, match=r"^`speed` is none of the options runs, t_nom_s, names"):
+    with pytest.raises(UsageError, match=r"^`speed` is not one of the options runs, t_nom_s, names"):
         Asked(speed=1)
 
 

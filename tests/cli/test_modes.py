@@ -145,5 +145,5 @@ def test_the_library_picks_a_mode_by_its_name(tmp_path: Path) -> None:
         library.run("toy", output=tmp_path, url="x")
     with pytest.raises(UsageError, match=r"^`live` is of mode live: give `mode` 'live'$"):
         library.run("toy", output=tmp_path, live=True)
-    with pytest.raises(UsageError, match="`mode`: 'lives' is none of computed, live, loop, predicted"):
+    with pytest.raises(UsageError, match="`mode`: 'lives' is not one of computed, live, loop, predicted"):
         library.run("toy", output=tmp_path, mode="lives")

@@ -67,7 +67,7 @@ def test_an_enclave_reaches_rclpy_by_its_variable() -> None:
         (["-e"], "-e needs a value"),
         (["-r", "a=b"], "-r a=b should look like from:=to"),
         (["-p", "max_tokens"], "-p max_tokens should look like name:=value"),
-        (["-p", "max_toks:=7"], "-p: 'max_toks' is none of engine, max_tokens"),
+        (["-p", "max_toks:=7"], "-p: 'max_toks' is not one of engine, max_tokens"),
         (["-p", "engine:=[a"], "-p engine:=.* is not YAML"),
         (["-p"], "-p needs a value"),
         (["--enclav", "x"], "--enclav is not one of -r, --remap"),
@@ -118,7 +118,7 @@ def test_a_file_for_others_is_said_to_be(file: Path) -> None:
         ("a: 1", "has no 'ros__parameters'"),
         ("- a", "has no 'ros__parameters'"),
         ("", "has no 'ros__parameters'"),
-        ("/llama/server:\n  ros__parameters: {wheel: 1}", r"/llama/server: 'wheel' is none of engine"),
+        ("/llama/server:\n  ros__parameters: {wheel: 1}", r"/llama/server: 'wheel' is not one of engine"),
         ("!!python/object:os.system a", "is not YAML"),
     ],
 )

@@ -111,9 +111,9 @@ def test_a_server_that_died_is_started_again_once(start: Start) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("colour = 1", "'colour' is none of engine, model"),
+        ("colour = 1", "'colour' is not one of engine, model"),
         ("threads = true", "threads = True should be a number"),
-        ("= 1", "no TOML"),
+        ("= 1", "not TOML"),
         ("max-tokens = 0", "max-tokens: 0 should be greater than or equal to 1"),
         ('max-body-mib = "much"', "--max-body-mib: 'much' should be a valid number"),
         ("result-timeout = inf", "result-timeout: inf should be less than or equal to 86400"),

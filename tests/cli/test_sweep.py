@@ -181,7 +181,7 @@ def test_the_papers_sweep_is_36_timelines() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('command = "fly"', "command: 'fly' is none of boundary, capacity, ccrb, chunks, latency"),
+        ('command = "fly"', "command: 'fly' is not one of boundary, capacity, ccrb, chunks, latency"),
         ('command = "timeline"\n[grid]\nplans = [1, 5]', "plans=5: --plans: without --jitter or --t-nom-cv all plans"),
         ('command = "timeline"\n[settings]\nt-min = "soon"', "t-min=soon: Invalid value for '--t-min'"),
         ('command = "latency"\n[settings]\nboard = "orin"', "--board: "),

@@ -24,7 +24,7 @@ WRONG = {
         (f"{ECHO} {ECHO} --output {__file__}", f"--output {__file__}: ", 1),
     ],
     "ccrb": [
-        ("--simulator gazebo", "--simulator: 'gazebo' is none of longitudinal, embedded"),
+        ("--simulator gazebo", "--simulator: 'gazebo' is not one of longitudinal, embedded"),
         ("--lane-change", "--lane-change: the longitudinal simulator knows one lane"),
         ("--live --rate 9", "--rate is an option of mode computed: leave out --live"),
         ("--closed-loop --ttc", "--ttc is an option of mode computed: leave out --closed-loop"),
@@ -42,7 +42,7 @@ WRONG = {
     ],
     "timeline": [
         ("--policy 'stream-to-act?cauton=2'", "; did you mean caution?"),
-        ("--jitter fog", "--jitter fog: family: 'fog' is none of"),
+        ("--jitter fog", "--jitter fog: family: 'fog' is not one of"),
         ("--pace 4.8", "--pace is an option of mode live: give --live"),
         ("--live --real-time", "--live and --real-time exclude each other"),
         ("--live --url http://localhost:1 --pace 3", "--pace needs the package's server"),
@@ -56,9 +56,9 @@ WRONG = {
         ("--trnsport ros", "No such option: --trnsport; did you mean --transport?"),
         ("--transport http/best-efort", "; did you mean best-effort?"),
         ("--transport http?conection=x", "; did you mean connection?"),
-        ("--engine lama", "'lama' is none of llama, echo, replay, call; did you mean llama?"),
+        ("--engine lama", "'lama' is not one of llama, echo, replay, call; did you mean llama?"),
         ("--url grpc+http://x", "--url: no installed transport speaks grpc+http://, only http://"),
-        ("--payload gif", "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
+        ("--payload gif", "--payload: 'gif' is not one of raw, yuyv, jpeg, jpeg-preencoded, png"),
         ("--url http://127.0.0.1:9 --transport http", "nothing answers at http://127.0.0.1:9", 1),
         ("--transport http,ros --template openvla-oft", "--template is about a server that runs already"),
         ("--transport grpc", "--transport grpc/lerobot is a client alone: name its --url, grpc://HOST:PORT"),
@@ -88,7 +88,7 @@ WRONG = {
         ("--resume /nowhere", "/nowhere is not a run folder", 1),
     ],
     "serve": [
-        ("pigeon", "--transport: 'pigeon' is none of http, ros, loopback"),
+        ("pigeon", "--transport: 'pigeon' is not one of http, ros, loopback"),
         ("grpc", "--transport: grpc is a client alone"),
         ("http --port 99999", "--port: 99999 should be less than or equal to 65535"),
         ("http --model /no/such", "--model /no/such: no such file; check the path", 1),

@@ -178,17 +178,17 @@ def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Calla
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"scenario": {"follower": "drunk"}}, "`follower`: 'drunk' is none of careful, hdm, idm, hybrid"),
+        ({"scenario": {"follower": "drunk"}}, "`follower`: 'drunk' is not one of careful, hdm, idm, hybrid"),
         ({"scenario": {"gap": "panic"}}, "`gap`: 'panic' should be 'stop', 'coast', 'hold' or 'cruise'"),
         ({"scenario": {"front_gap_m": 0.0}}, "`front_gap_m`: 0.0 should be greater than 0"),
         ({"scenario": {"n_skills": 0}}, "`n_skills`: 0 should be greater than or equal to 1"),
         ({"scenario": {"t_nom_s": 0.1}}, "the plan brakes at"),
         ({"scenario": {"lane_change": True}}, "`lane_change`: .* take `simulator` embedded"),
         ({"phase_rates": (5.0, 2.0)}, "`phase_rates`: should be two numbers .*, the lower first"),
-        ({"rate": 0.01}, "which is no driving"),
+        ({"rate": 0.01}, "which is too slow to drive"),
         ({"rate": float("nan")}, "`rate`: nan should be"),
-        ({"profile": "abacus"}, "'abacus' is none of"),
-        ({"policies": ("hope",)}, "'hope' is none of"),
+        ({"profile": "abacus"}, "'abacus' is not one of"),
+        ({"policies": ("hope",)}, "'hope' is not one of"),
     ],
 )
 def test_what_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:

@@ -291,7 +291,7 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
     ("fields", "message"),
     [
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
-        ({"skills": "juggling"}, "`skills`: 'juggling' is none of"),
+        ({"skills": "juggling"}, "`skills`: 'juggling' is not one of"),
         ({"epsilon": 0.05}, "`epsilon`: no policy is calibrated before a live run; it needs `track`"),
         ({"requests": {"requests": 0}}, "`requests`: 0 should be greater than or equal to 1"),
         ({"robot": "call", "policies": ("naive",)}, "`robot`: call: function = '' should look like module:name"),
@@ -387,7 +387,7 @@ def test_lambda_is_followed_live_by_each_policy(
 ) -> None:
     policies = ("stream-to-act", "stream-to-act?detect=True", "naive")
     live(requesting(config, requests=2).but(policies=policies, track=True, n_skills=(3,)), tmp_path)
-    assert [each.made.detect for each in taught] == [False, True] * 2
+    assert [each.base.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
     for each in taught[:2]:
         assert each.tracker.level != each.tracker.epsilon == 0.01

@@ -45,7 +45,7 @@ def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[
         REQUESTS.but(reference=program, **fields)
     assert message in str(error.value)
     for wrong in (tmp_path, tmp_path / "missing", Path(__file__)):
-        with pytest.raises(UsageError, match=r"`reference`: .* is no program that can be run"):
+        with pytest.raises(UsageError, match=r"`reference`: .* is not an executable program"):
             REQUESTS.but(reference=wrong)
 
 
@@ -62,7 +62,7 @@ def test_the_engine_llama_server_is_llama_cpps_own_beside_ours() -> None:
         ThroughputConfig(
             engine={"name": "llama-server", "sampling": "greedy"}, options={"http": {"llama_server": sys.executable}}
         )
-    with pytest.raises(UsageError, match="'llamaserver' is none of llama, echo, replay"):
+    with pytest.raises(UsageError, match="'llamaserver' is not one of llama, echo, replay"):
         ThroughputConfig(engine={"name": "llamaserver"})
 
 
@@ -86,9 +86,9 @@ def test_several_ways_of_flash_attention_are_cells_with_servers_of_their_own() -
             {"engine": {"sampling": "greedy"}, "transports": "http/best-effort?url=http://x"},
             "`sampling` greedy is our own engine's",
         ),
-        ({"engine": {"flash_attention": "on,of"}}, "`flash_attention`: 'of' is none of auto, on, off"),
-        ({"engine": {"flash_attention": ""}}, "`flash_attention`: '' is none of auto, on, off"),
-        ({"transports": "in-process?flash_attention=x"}, "`flash_attention`: 'x' is none of auto, on, off"),
+        ({"engine": {"flash_attention": "on,of"}}, "`flash_attention`: 'of' is not one of auto, on, off"),
+        ({"engine": {"flash_attention": ""}}, "`flash_attention`: '' is not one of auto, on, off"),
+        ({"transports": "in-process?flash_attention=x"}, "`flash_attention`: 'x' is not one of auto, on, off"),
         ({"engine": {"flash_attention": "on,off", "kv_type": "q8_0"}}, "`kv_type` q8_0 needs flash attention"),
         (
             {"engine": {"flash_attention": "on,off", "name": "replay", "profile": "rtx-4080"}},

@@ -118,7 +118,7 @@ def test_online_without_jitter_starts_at_the_safe_start_exactly(
     )
     (case,) = config.cases
     _, plans = draw(case, 0, 1, "plans")
-    schedule = learn(case, LearningPlan({"online": StreamToAct()}, 0)).made["online"].schedule(plans)
+    schedule = learn(case, LearningPlan({"online": StreamToAct()}, 0)).by_name["online"].schedule(plans)
     safe_s = safe_start(plans.arrival_s, plans.nominal_s)
     assert schedule.start_s[0] == pytest.approx(safe_s, rel=1e-9, abs=1e-9)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]

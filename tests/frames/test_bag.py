@@ -147,12 +147,12 @@ def test_an_image_topic_without_messages_is_no_endless_loop(tmp_path: Path, open
 def test_a_file_that_is_none_is_named(tmp_path: Path, name: str, content: bytes, opened: Open) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(SourceError, match=rf"^`source`: .*{name} (is no recording|has no topic)"):
+    with pytest.raises(SourceError, match=rf"^`source`: .*{name} (is not a recording|has no topic)"):
         opened(path)
 
 
 def test_a_folder_that_is_none_is_named(tmp_path: Path, opened: Open) -> None:
-    with pytest.raises(SourceError, match=r"^`source`: .* is no recording"):
+    with pytest.raises(SourceError, match=r"^`source`: .* is not a recording"):
         opened(tmp_path)
 
 
@@ -177,7 +177,7 @@ def test_yaml_that_is_none_is_one_line(tmp_path: Path, text: str, reason: str, o
     with pytest.raises(SourceError) as error:
         opened(tmp_path)
     (line,) = str(error.value).splitlines()
-    assert f"{tmp_path} is no recording that can be read (" in line
+    assert f"{tmp_path} is not a recording that can be read (" in line
     assert reason in line
     assert len(line) < 600
 

@@ -104,7 +104,7 @@ def test_jpeg_keeps_colours_and_their_order() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"x", b"\xff\xd8\xff\xe0" + bytes(60), bytes(1000)])
 def test_garbage_is_no_picture(data: bytes) -> None:
-    with pytest.raises(ValueError, match=f"the {len(data)} bytes are no picture"):
+    with pytest.raises(ValueError, match=f"the {len(data)} bytes are not a picture"):
         decode_image(data)
 
 
@@ -179,7 +179,7 @@ def test_a_bomb_is_refused_by_its_header(tmp_path: Path, first: str, data: bytes
     command = [sys.executable, "-c", DECODES.format(first=first), str(tmp_path / "bomb")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     kib, said = done.stdout.split(" ", 1)
-    assert said == f"the {len(data)} bytes are no picture that OpenCV can read{reason}\n"
+    assert said == f"the {len(data)} bytes are not a picture that OpenCV can read{reason}\n"
     assert int(kib) < 20 << 10
 
 

@@ -52,7 +52,7 @@ def test_a_folder_without_pictures_says_what_it_takes(tmp_path: Path) -> None:
 
 def test_an_unreadable_picture_is_named_at_once(folder: Path) -> None:
     (folder / "d.jpg").write_bytes(b"no picture")
-    with pytest.raises(SourceError, match=r"^`source`: cannot read .*d\.jpg: the 10 bytes are no picture"):
+    with pytest.raises(SourceError, match=r"^`source`: cannot read .*d\.jpg: the 10 bytes are not a picture"):
         ImageFolder(str(folder), 64, 48)
 
 

@@ -209,7 +209,7 @@ def test_a_picture_that_cannot_be_read_is_one_line(camera: Camera, running: Runn
 def test_bytes_that_are_no_message_are_one_line(camera: Camera, running: Running) -> None:
     publisher = camera.node.publisher(TOPIC, ros.IMAGE, QoS(1))
     running(lambda: publisher.send(bytearray(b"\0\1\0\0" + b"\xff" * 64)))
-    with pytest.raises(SourceError, match=rf"^`source`: ros:{TOPIC}.*: received bytes that are no {ros.IMAGE}"):
+    with pytest.raises(SourceError, match=rf"^`source`: ros:{TOPIC}.*: received bytes that are not a {ros.IMAGE}"):
         camera.source(wait_s=2)
 
 
@@ -238,7 +238,7 @@ def test_frames_of_another_size_are_scaled_and_another_format_is_refused(camera:
     [
         ("camera", "'ros:camera' should look like ros:/camera/image_raw"),
         ("/a b", "should look like"),
-        ("/camera?domain=5", "'domain' is no parameter; its parameters are middleware, domain_id, router, wait_s"),
+        ("/camera?domain=5", "'domain' is not a parameter; its parameters are middleware, domain_id, router, wait_s"),
         ("/camera?domain_id=500", "domain_id = '500'"),
         ("/camera?middleware=zmq", "middleware = 'zmq'"),
         ("/camera?wait_s=0", "wait_s = '0'"),

@@ -204,8 +204,8 @@ def test_what_is_no_camera_is_named_without_noise(tmp_path: Path, capfd: pytest.
     file.touch()
     for path, says in {
         "/dev/video99": "no camera at /dev/video99; `ls /dev/video",
-        "/dev/null": "/dev/null is no camera",
-        str(file): f"{file} is no camera",
+        "/dev/null": "/dev/null is not a camera",
+        str(file): f"{file} is not a camera",
         str(tmp_path): ".*Is a directory",
     }.items():
         with pytest.raises(SourceError, match=f"^`source`: {says}"):

@@ -43,7 +43,7 @@ def test_frames_come_in_order_and_start_over(clip: str, size: tuple[int, int]) -
 def test_a_file_that_is_no_video_is_named(tmp_path: Path) -> None:
     path = tmp_path / "text.mp4"
     path.write_text("no video")
-    with pytest.raises(SourceError, match=r"^`source`: .*text\.mp4 is no video"):
+    with pytest.raises(SourceError, match=r"^`source`: .*text\.mp4 is not a video"):
         VideoFile(str(path), 64, 48)
 
 

@@ -111,7 +111,7 @@ def test_the_text_of_an_action_reads_back_to_the_same_bits() -> None:
         ([], r"actions: shape \(0,\)"),
         ([[]], "actions: shape"),
         ([[[1.0]], [[1.0]]], "actions: shape"),
-        ([[1.0], [1.0, 2.0]], "actions: no array of numbers"),
+        ([[1.0], [1.0, 2.0]], "actions: not an array of numbers"),
         ([[True]], "actions: shape .* and type bool"),
         (np.zeros((1 << 11, 1 << 10)), "actions: 2097152 numbers; at most"),
         (np.array([object()]), "actions: shape .* and type object"),

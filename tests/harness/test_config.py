@@ -30,13 +30,13 @@ def names(config: RequestsConfig) -> list[str]:
 @pytest.fixture(autouse=True)
 def no_llama_server(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether llama.cpp's own server is on this machine decides nothing here; where it matters, a test says so."""
-    monkeypatch.setattr(http, "found_llama_server", lambda: None)
+    monkeypatch.setattr(http, "installed_llama_server", lambda: None)
 
 
 @pytest.fixture
 def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have llama.cpp's own server on this machine, and nothing that our own could run a model with."""
-    monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
+    monkeypatch.setattr(http, "installed_llama_server", lambda: http.WHEEL)
     monkeypatch.setattr(extras, "installed", lambda module: module != "llama_cpp")
 
 
@@ -55,7 +55,7 @@ def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
     options: dict[str, Any], there: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
+    monkeypatch.setattr(http, "installed_llama_server", lambda: http.WHEEL)
     config = RequestsConfig(**options)
     assert ("http/llama-server" in names(config)) is there
     for cell in config.pipelines:
@@ -190,8 +190,8 @@ def test_a_namespace_in_a_url_names_our_server_there() -> None:
     ("fields", "message"),
     [
         ({"transports": ()}, "`transport`: name at least one of http, ros, loopback"),
-        ({"transports": ("http/fast",)}, "`transport`: 'fast' is none of http's as-deployed, best-effort, binary"),
-        ({"transports": ("loopback/fast",)}, "`transport`: 'fast' is none of loopback's none: it has no variants"),
+        ({"transports": ("http/fast",)}, "`transport`: 'fast' is not one of http's as-deployed, best-effort, binary"),
+        ({"transports": ("loopback/fast",)}, "`transport`: 'fast' is not one of loopback's variants: it has none"),
         ({"transports": "http/llama-server"}, "there is none on PATH"),
         (
             {"transports": "http/llama-server", "payload": "raw", "options": LLAMA_SERVER},
@@ -201,14 +201,14 @@ def test_a_namespace_in_a_url_names_our_server_there() -> None:
         ({"transports": "http/best-effort", "options": LLAMA_SERVER}, "`llama_server` needs http/llama-server among"),
         ({"transports": "ros", "options": LLAMA_SERVER}, "`llama_server` needs http among `transport`"),
         ({"transports": "ros", "url": "http://x"}, "`url` needs http among"),
-        ({"transports": "ros/service"}, "`transport`: 'service' is none of ros's topic, action"),
+        ({"transports": "ros/service"}, "`transport`: 'service' is not one of ros's topic, action"),
         ({"payload": "yuyv"}, "`payload`: http/as-deployed can send a picture as jpeg, jpeg-preencoded, png, raw"),
         ({"payload": "yuyv"}, "http/as-deployed?payload=jpeg"),
         ({"options": {"http": {"connection": "x"}}}, "`connection`: 'x' should be 'keep-alive'"),
         ({"mode": "x"}, "`mode`: 'x'"),
         ({"options": {"ros": {"dds_tuning": "x"}}}, "`dds_tuning`: 'x'"),
         ({"options": {"ros": {"qos": "x"}}}, "`qos`: 'x' should be 'reliable' or 'sensor_data'"),
-        ({"options": {"ros": {"middleware": "x"}}}, "`middleware`: 'x' is none of cyclonedds, rclpy, zenoh"),
+        ({"options": {"ros": {"middleware": "x"}}}, "`middleware`: 'x' is not one of cyclonedds, rclpy, zenoh"),
         ({"options": {"ros": {"result_timeout": -1}}}, "`result_timeout`: -1 should be greater than or equal to 0"),
         ({"options": {"http": {"port": "many"}}}, "`port`: 'many' should be a valid integer"),
         ({"requests": 0}, "`requests`: 0 should be greater than or equal to 1"),
@@ -225,7 +225,7 @@ def test_a_namespace_in_a_url_names_our_server_there() -> None:
         ({"size": "641x480"}, "`size`: 641x480"),
         ({"size": (8, 8)}, "`size`: 8x8"),
         ({"options": {"http": {"url": "http://[::1"}}}, "`url`: 'http://[::1'"),
-        ({"options": {"http": {"llama_server": "/no/such"}}}, "`llama_server`: /no/such is no program that can be run"),
+        ({"options": {"http": {"llama_server": "/no/such"}}}, "`llama_server`: /no/such is not an executable"),
         (
             {"url": "gopher://x"},
             "`url`: no installed transport speaks gopher://, only http://, https://, ros://, ws://, wss://, tcp://",
@@ -242,10 +242,10 @@ def test_a_namespace_in_a_url_names_our_server_there() -> None:
         ({"options": {"http": {"url": "http://x", "llama_server": Path("y")}}}, "`url` and `llama_server`"),
         ({"options": URL, "payload": "raw"}, "can send a picture as jpeg, jpeg-preencoded, png, not as raw"),
         ({"options": {"http": {"url": "http://x", "dialect": "openvla"}}, "payload": "jpeg"}, "as raw, not as jpeg"),
-        ({"options": {"http": {"url": "http://x", "dialect": "smoke"}}}, "`dialect`: 'smoke' is none of s2a, openai"),
+        ({"options": {"http": {"url": "http://x", "dialect": "smoke"}}}, "`dialect`: 'smoke' is not one of s2a"),
         ({"options": {"http": {"dialect": "tgi"}}}, "`dialect` is about a server that runs already"),
         ({"options": {"http": {"llama_server": "x", "extra_body": "{}"}}}, "`extra_body` is about a server that runs"),
-        ({"options": {"http": {"url": "http://x", "extra_body": "{"}}}, "`extra_body`: no JSON"),
+        ({"options": {"http": {"url": "http://x", "extra_body": "{"}}}, "`extra_body`: not JSON"),
         ({"options": {"http": {"url": "http://x", "api_key_env": "sk-1"}}}, "`api_key_env` takes the name of an env"),
         ({"options": {"http": {"url": "http://x", "api_key_env": "NO_KEY"}}}, "`api_key_env`: the environment has no"),
         ({"options": {"http": {"url": "http://u:p@x"}}}, "`url`: leave the password out"),

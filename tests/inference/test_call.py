@@ -103,9 +103,9 @@ def test_a_function_that_fails_is_one_line(act: object, message: str) -> None:
     ("given", "message"),
     [
         ({"name": "call"}, "`engine`: call: function = '' should look like module:name"),
-        ({"name": "call?funktion=a:b"}, "`engine`: call: 'funktion' is no parameter; its parameters are function"),
-        ({"name": "echo?function=a:b"}, "`engine`: echo: 'function' is no parameter; it has no parameters"),
-        ({"name": "calls"}, "`name`: 'calls' is none of llama, echo, replay, call"),
+        ({"name": "call?funktion=a:b"}, "`engine`: call: 'funktion' is not a parameter; its parameters are function"),
+        ({"name": "echo?function=a:b"}, "`engine`: echo: 'function' is not a parameter; it has no parameters"),
+        ({"name": "calls"}, "`name`: 'calls' is not one of llama, echo, replay, call"),
         ({"name": "call?function=no_such_policy:act"}, "`engine`: call: no_such_policy:act does not load: ModuleNotF"),
         ({"name": POLICY, "answer": "tokens"}, "`answer` tokens: `engine` call answers with actions alone"),
         ({"name": POLICY, "gpu_layers": 3}, "`gpu_layers` is for an engine with a model"),

@@ -14,11 +14,11 @@ from s2a_bench.inference import EngineConfig
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"name": "gpt"}, "`name`: 'gpt' is none of llama, echo"),
-        ({"kv_type": "q5_1"}, "`kv_type`: 'q5_1' is none of f32, f16, q8_0, q4_0"),
+        ({"name": "gpt"}, "`name`: 'gpt' is not one of llama, echo"),
+        ({"kv_type": "q5_1"}, "`kv_type`: 'q5_1' is not one of f32, f16, q8_0, q4_0"),
         ({"kv_type": "q8_0", "flash_attention": "off"}, "`kv_type` q8_0 needs flash attention"),
-        ({"flash_attention": "yes"}, "`flash_attention`: 'yes' is none of auto, on, off"),
-        ({"sampling": "beam"}, "`sampling`: 'beam' is none of model, greedy"),
+        ({"flash_attention": "yes"}, "`flash_attention`: 'yes' is not one of auto, on, off"),
+        ({"sampling": "beam"}, "`sampling`: 'beam' is not one of model, greedy"),
         ({"batch": 0}, "`batch`: 0 should be greater than or equal to 32"),
         ({"context": 10}, "`context`: 10 should be greater than or equal to 256"),
         ({"threads": -1}, "`threads`: -1"),

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from s2a_bench.cli.model import app
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import EngineConfig, FetchConfig
-from s2a_bench.inference.fetch import Fetched, chosen
+from s2a_bench.inference.fetch import Fetched, selected_files
 from s2a_bench.inference.fetch import fetch as fetch_config
 from s2a_bench.inference.models import HUB_MODELS, fetched, load_headers
 
@@ -346,12 +346,12 @@ def test_the_listing_gives_one_language_model_or_names_all(
 ) -> None:
     config = FetchConfig(what="a/b", quant=quant)
     if names is not None:
-        assert chosen("a/b", "", config, files) == [*names]
+        assert selected_files("a/b", "", config, files) == [*names]
         return
     with pytest.raises(
         ModelError, match=rf"^a/b: no model is {quant or 'Q4_K_M or Q8_0'}, or several; it has "
     ) as error:
-        chosen("a/b", "", config, files)
+        selected_files("a/b", "", config, files)
     assert all(file in str(error.value) for file in files if file.endswith("gguf"))
 
 

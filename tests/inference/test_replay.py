@@ -189,9 +189,9 @@ def test_facts_tell_prompt_and_decoding_time() -> None:
     ("config", "message"),
     [
         (EngineConfig(name="replay"), "`engine` replay needs `profile` NAME"),
-        (EngineConfig(name="replay", profile="tx1"), "`profile`: 'tx1' is none of"),
+        (EngineConfig(name="replay", profile="tx1"), "`profile`: 'tx1' is not one of"),
         (EngineConfig(name="replay", profile="rtx-4080", gaps="trace"), "profile rtx-4080 holds no recording"),
-        (EngineConfig(name="replay", profile="rtx-4080", gaps="wild"), "'wild' is none of constant, parametric"),
+        (EngineConfig(name="replay", profile="rtx-4080", gaps="wild"), "'wild' is not one of constant, parametric"),
         (EngineConfig(name="llama", gaps="trace"), "`gaps` needs `engine` replay"),
     ],
 )

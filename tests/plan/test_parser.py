@@ -232,11 +232,11 @@ def test_a_code_is_certain_at_once() -> None:
 @pytest.mark.parametrize(
     ("line", "problem", "why"),
     [
-        ("1. dance(kitchen)", "unknown-skill", "'dance' is none of the skills"),
-        ("1. Go_to(kitchen)", "unknown-skill", "'Go_to' is none of the skills"),
-        ("1. go_to(moon)", "bad-argument", "'moon' is no location of go_to"),
+        ("1. dance(kitchen)", "unknown-skill", "'dance' is not one of the skills"),
+        ("1. Go_to(kitchen)", "unknown-skill", "'Go_to' is not one of the skills"),
+        ("1. go_to(moon)", "bad-argument", "'moon' is not a valid location of go_to"),
         ("1. place(cup)", "bad-argument", "place has 2 arguments, 1 are given"),
-        ("1. place(table, cup)", "bad-argument", "'table' is no object of place"),
+        ("1. place(table, cup)", "bad-argument", "'table' is not a valid object of place"),
         ("1. go_to()", "bad-argument", "go_to has 1 arguments, 0 are given"),
         ("1. go_to(kitchen, kitchen)", "malformed", "go_to is not written as listed"),
         ("1. go_to(kitchen) and rest", "malformed", "go_to is not written as listed"),

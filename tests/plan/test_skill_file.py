@@ -119,7 +119,7 @@ def test_the_household_speaks_the_papers_plan() -> None:
         ("to = 0.3", "to = 100000", "vocabulary.height: 1000000 values; at most 1024"),
         ("to = 0.3", "to = 30", "skill: 1201 calls are possible, at most 1024"),
         ("[[skill]]", "[[skills]]", "skills: there is no such key; did you mean skill?"),
-        ("[vocabulary]", "[vocabulary", "no TOML: "),
+        ("[vocabulary]", "[vocabulary", "not TOML: "),
     ],
 )
 def test_an_error_names_file_and_key(old: str, new: str, message: str) -> None:
@@ -131,7 +131,7 @@ def test_an_error_names_file_and_key(old: str, new: str, message: str) -> None:
 
 
 def test_a_choice_that_is_neither_a_name_nor_a_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="`skills`: 'kitchen' is none of household, driving, and no path"):
+    with pytest.raises(UsageError, match="`skills`: 'kitchen' is not one of household, driving, and no path"):
         load_skills("kitchen")
     with pytest.raises(UsageError, match=r"`skills`: cannot read /no/such\.toml: .*No such file"):
         load_skills("/no/such.toml")

@@ -30,7 +30,7 @@ PLUGINS = {
     "carla": [
         Named(
             "ccrb --simulator carla",
-            "--simulator: 'carla' is none of ",
+            "--simulator: 'carla' is not one of ",
             "ccrb --help-all",
             "longitudinal, embedded, carla",
         )
@@ -39,18 +39,18 @@ PLUGINS = {
         Named("latency --link 4g", "No such option: --link", "latency --help-all", "--link "),
         Named("latency --clock ptp", "No such option: --clock", "latency --help-all", "--clock "),
         Named("advise --link 4g", "No such command 'advise'", "--help", "advise  "),
-        Named("sweep links", "'links' is none of ", "sweep --help", "links"),
+        Named("sweep links", "'links' is not one of ", "sweep --help", "links"),
     ],
     "policy_servers": [
         Named(
             "latency --transport websocket",
-            "--transport: 'websocket' is none of ",
+            "--transport: 'websocket' is not one of ",
             "latency --help-all",
             "loopback, websocket, zmq, grpc",
         ),
         Named(
             "latency --url http://127.0.0.1:9 --dialect openvla",
-            "--dialect: 'openvla' is none of ",
+            "--dialect: 'openvla' is not one of ",
             "latency --help-all",
             "--template",
         ),
@@ -64,9 +64,9 @@ PLUGINS = {
         Named("task", "No such command 'task'", "--help", "task "),
     ],
     "watch": [Named("watch", "No such command 'watch'", "--help", "watch ")],
-    "rclpy": [Named("latency --middleware rclpy", "--middleware: 'rclpy' is none of ", "latency --help-all", "rclpy")],
+    "rclpy": [Named("latency --middleware rclpy", "--middleware: 'rclpy' is not one", "latency --help-all", "rclpy")],
     "zenoh": [
-        Named("latency --middleware zenoh", "--middleware: 'zenoh' is none of ", "latency --help-all", "zenoh"),
+        Named("latency --middleware zenoh", "--middleware: 'zenoh' is not one of ", "latency --help-all", "zenoh"),
         Named("latency --router tcp/127.0.0.1:7447", "No such option: --router", "latency --help-all", "--router"),
     ],
 }

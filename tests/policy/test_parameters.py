@@ -72,8 +72,8 @@ def test_two_ways_to_write_one_policy_are_one() -> None:
 @pytest.mark.parametrize(
     ("written", "message"),
     [
-        ("naive?x=1", "naive: 'x' is no parameter; it has no parameters"),
-        ("toy?size=1", "toy: 'size' is no parameter; its parameters are factor, mood, late"),
+        ("naive?x=1", "naive: 'x' is not a parameter; it has no parameters"),
+        ("toy?size=1", "toy: 'size' is not a parameter; its parameters are factor, mood, late"),
         ("toy?factor=2&factor=3", "toy: 'factor' is given twice; its parameters are"),
         ("toy?factor=0", "toy: factor = '0': input should be greater than or equal to 1; its parameters are"),
         ("toy?factor=two", "toy: factor = 'two': input should be a valid integer"),
@@ -81,7 +81,7 @@ def test_two_ways_to_write_one_policy_are_one() -> None:
         ("stream-to-act?caution=-1", "caution = '-1': input should be greater than or equal to 0"),
         ("stream-to-act?caution=nan", "caution = 'nan': input should be greater than or equal to 0"),
         ("toy?late=1&factor=9", "toy: a late toy has a factor below 9; its parameters are factor, mood, late"),
-        ("stream-to-act?prior=1", "stream-to-act: 'prior' is no parameter; its parameters are caution"),
+        ("stream-to-act?prior=1", "stream-to-act: 'prior' is not a parameter; its parameters are caution"),
     ],
 )
 def test_wrong_parameters_are_one_line_that_names_policy_parameter_and_choice(written: str, message: str) -> None:

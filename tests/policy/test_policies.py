@@ -24,7 +24,7 @@ SKILL = Timing(1.0, 0.8, 1.5)
 
 
 def test_an_unknown_policy_is_refused_with_the_names_there_are() -> None:
-    with pytest.raises(UsageError, match="`policy`: 'eager' is none of naive, wait-then-act, stream-to-act"):
+    with pytest.raises(UsageError, match="`policy`: 'eager' is not one of naive, wait-then-act, stream-to-act"):
         policy("eager")
 
 

@@ -41,7 +41,7 @@ def test_dds_stays_on_loopback_unless_asked(
     ("name", "text", "message"),
     [
         ("ROS_STATIC_PEERS", "not a host", "'not a host'"),
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "moon", "'MOON' is none of OFF"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "moon", "'MOON' is not one of OFF"),
         *(("ROS_DOMAIN_ID", text, "") for text in ("-1", "233", "x", "1.5")),
     ],
 )

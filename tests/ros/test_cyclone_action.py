@@ -175,7 +175,7 @@ def test_malformed_requests_leave_the_server_up(join: Join, caplog: pytest.LogCa
     damaged[36:40] = b"\xff\xff\xff\x7f"  # the prompt's length
     client.send(damaged)
     goal = receive(action.server)
-    with pytest.raises(TransportError, match="received bytes that are no llama_msgs/action/GenerateResponse_SendGoal"):
+    with pytest.raises(TransportError, match="bytes that are not a llama_msgs/action/GenerateResponse_SendGoal"):
         goal.unpack()
     goal.reject()
     event(client, Rejected)

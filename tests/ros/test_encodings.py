@@ -114,7 +114,7 @@ def test_a_mosaic_of_one_colour_is_that_colour(encoding: str) -> None:
     ],
 )
 def test_what_does_not_fit_its_encoding_is_refused(encoding: str, fields: dict[str, Any]) -> None:
-    says = None if encoding else "image encoding '' is none of bgr8, rgb8, bgra8"
+    says = None if encoding else "image encoding '' is not one of bgr8, rgb8, bgra8"
     with pytest.raises(TransportError, match=says):
         picture_of(image(encoding, pixels(encoding if encoding in SHAPES else "bgra8"), **fields), Trace())
 

@@ -36,5 +36,5 @@ def test_received_pixels_are_a_view_not_a_copy() -> None:
 
 @pytest.mark.parametrize("cdr", [b"", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\x7f", bytes(64)])
 def test_foreign_bytes_are_refused(cdr: bytes) -> None:
-    with pytest.raises(TransportError, match="no s2a_msgs/msg/Request"):
+    with pytest.raises(TransportError, match="not a s2a_msgs/msg/Request"):
         ros.deserialise(memoryview(cdr), ros.REQUEST)

@@ -36,7 +36,7 @@ def test_without_a_domain_that_of_the_environment_is_joined(dds_domain: int, mon
 
 
 def test_an_unknown_middleware_is_named() -> None:
-    with pytest.raises(UsageError, match="`middleware`: 'iceoryx' is none of cyclonedds, rclpy, zenoh"):
+    with pytest.raises(UsageError, match="`middleware`: 'iceoryx' is not one of cyclonedds, rclpy, zenoh"):
         open_middleware("iceoryx")
 
 

@@ -123,7 +123,7 @@ def test_atomically_is_all_or_nothing(node: ParameterNode) -> None:
 
 def test_an_impossible_type_is_refused(node: ParameterNode) -> None:
     strange = ros.default(PARAMETER, name="depth", value=ros.default("rcl_interfaces/msg/ParameterValue", type=77))
-    assert "77 is no type" in node("SetParameters", parameters=[strange]).results[0].reason
+    assert "77 is not a type" in node("SetParameters", parameters=[strange]).results[0].reason
 
 
 def test_types_are_numbered_as_in_ros() -> None:

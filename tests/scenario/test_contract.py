@@ -41,5 +41,5 @@ def test_parameters_of_a_simulator_are_the_fields_of_its_dataclass(monkeypatch: 
     assert (far.host, far.port) == ("here", 2042)
     with pytest.raises(UsageError, match=r"^`simulator`: far: port = 'x': input should be a valid integer"):
         open_simulator("far?port=x")
-    with pytest.raises(UsageError, match=r"^`simulator`: far: 'hots' is no parameter; .* did you mean host"):
+    with pytest.raises(UsageError, match=r"^`simulator`: far: 'hots' is not a parameter; .* did you mean host"):
         open_simulator("far?hots=there")

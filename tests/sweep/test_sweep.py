@@ -86,7 +86,7 @@ def write(folder: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("command = ", "no TOML"),
+        ("command = ", "not TOML"),
         ('comand = "timeline"', "comand: there is no such key; did you mean command?"),
         ("repeats = 2", "command: is missing"),
         ("command = 3", "command: 3 should be a text"),
@@ -101,8 +101,8 @@ def write(folder: Path, text: str) -> Path:
         ('command = "t"\n[zip]\na = [1, 2]\nb = [1]', "zip: axes go side by side and need one length, but have a 2"),
         ('command = "t"\n[settings]\nseed = 1', "settings.seed: the seed is a key at the top of the file"),
         ('command = "t"\n[settings]\noutput = "x"', "settings.output: --output of 's2a-bench sweep'"),
-        ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrates = 3', "exclude.rates: it is no axis; did you mean"),
-        ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrate = 4', "exclude.rate: 4 is no value of that axis"),
+        ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrates = 3', "exclude.rates: it is not an axis; did you mean"),
+        ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrate = 4', "exclude.rate: 4 is not a value of that axis"),
         ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrate = 3', "exclude: no cell is left"),
         ('command = "t"\nrepeats = 60000\n[grid]\nrate = [3, 4]', "120000 cells are more than 100000"),
     ],
@@ -157,13 +157,13 @@ def test_cells_of_one_repeat_share_its_seed_so_that_they_are_compared_on_the_sam
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"rat": 1}, "s.toml: 'rat' is no flag of s2a-bench fly; did you mean rate?"),
-        ({"zzz": 1}, "s.toml: 'zzz' is no flag of s2a-bench fly; it has board, film, live, name, profile, rate"),
+        ({"rat": 1}, "s.toml: 'rat' is not a flag of s2a-bench fly; did you mean rate?"),
+        ({"zzz": 1}, "s.toml: 'zzz' is not a flag of s2a-bench fly; it has board, film, live, name, profile, rate"),
         ({"live": 1}, "s.toml: live: 1 should be true or false"),
         ({"rate": True}, "s.toml: rate: True should be text or a number"),
         ({"rate": [{"a": 1}]}, "s.toml: rate: {'a': 1} should be text or a number"),
         ({"board": 3}, "s.toml: board: 3 should be the name of a machine"),
-        ({"profile": "abacus"}, "'abacus' is none of"),
+        ({"profile": "abacus"}, "'abacus' is not one of"),
     ],
 )
 def test_a_setting_that_the_command_does_not_have_is_refused(setting: dict[str, Any], message: str) -> None:

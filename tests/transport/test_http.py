@@ -116,7 +116,7 @@ def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
         ("as-deployed", "{}", "body.messages"),
         ("as-deployed", "{", "JSON"),
         ("as-deployed", '{"messages": []}', "messages"),
-        ("best-effort", "{", "no JSON"),
+        ("best-effort", "{", "not JSON"),
         ("best-effort", "{}", "messages"),
         ("best-effort", '{"messages": []}', "messages"),
         ("best-effort", '{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),

@@ -130,8 +130,8 @@ def test_http_1_0_has_no_chunks_and_ends_with_the_connection(stream: bool) -> No
         (request(b"", "Transfer-Encoding: chunked") + b"0\r\n\r\n", 411, "Content-Length"),
         (request(b"", "Content-Length: 3", "Content-Length: 5"), 400, "Content-Length"),
         (b"CONNECT a:80 HTTP/1.1\r\nHost: localhost\r\n\r\n", 404, "POST to one of"),
-        (b"\x16\x03\x01\r\n\r\n", 400, "no HTTP request"),
-        (b"\r\n\r\n", 400, "no HTTP request"),
+        (b"\x16\x03\x01\r\n\r\n", 400, "not an HTTP request"),
+        (b"\r\n\r\n", 400, "not an HTTP request"),
         (request(b"", "a: " + "b" * 70_000), 431, "bytes of headers"),
     ],
 )

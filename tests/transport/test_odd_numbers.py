@@ -126,7 +126,7 @@ def test_facts_of_marks_are_checked_in_name_and_value() -> None:
     trace = Trace()
     trace.receive(Remote("c", facts={"prompt_n": float("nan"), "\x1b[2J": 1.0, "x" * 99: 1.0, "load": 0.5}))
     assert trace.facts == {"load": 0.5}
-    assert trace.odd == {"prompt_n", "a name that is none"}
+    assert trace.odd == {"prompt_n", "an invalid name"}
 
 
 @pytest.mark.parametrize("odd", [{"stamps": [1, 2]}, {"stamps": [-1]}, {"fact_names": ["a"]}])
@@ -140,5 +140,5 @@ def test_ros_marks_that_can_be_none_fail_their_sample(odd: dict[str, list[Any]])
         **odd,
     }
     arrays = {name: np.array(value) for name, value in lists.items() if "stamps" in name or name == "fact_values"}
-    with pytest.raises(RequestFailed, match="the server's marks are none"):
+    with pytest.raises(RequestFailed, match="the server's marks are malformed"):
         remote_of(SimpleNamespace(**{"clock": "c", "frame_stamp": -1, **lists, **arrays}))

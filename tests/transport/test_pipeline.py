@@ -61,7 +61,7 @@ def test_options_hold_for_every_variant_that_is_meant() -> None:
         ("ros?payload", "'ros?payload' should look like ros?option=value"),
         ("http?port=x", "`port`: 'x' should be a valid integer"),
         ("ros?publish_tokens=maybe", "`publish_tokens`: 'maybe' should be a valid boolean"),
-        ("", "`transport`: '' is none of http, ros, loopback"),
+        ("", "`transport`: '' is not one of http, ros, loopback"),
     ],
 )
 def test_what_a_name_cannot_say_is_one_line(text: str, message: str) -> None:

@@ -93,7 +93,7 @@ def test_an_http_server_that_closes_connections_is_told_of(head: bytes, code: st
 
 @pytest.mark.parametrize("url", ["foo://x", "http://", "grpc://:80", "http://[x", "http://a:99999999", "x", ""])
 def test_what_is_no_url_of_a_server_is_refused(url: str) -> None:
-    with pytest.raises(UsageError, match=r"^`url`: (that is no URL|'.*' should look like http://192.168.0.5:8000: )"):
+    with pytest.raises(UsageError, match=r"^`url`: (that is not a|'.*' should look like http://192.168.0.5:8000: )"):
         examine(url)
 
 

@@ -62,8 +62,8 @@ def rows(
     n_skills, plans, jitter = config.n_skills, config.plans_a_point, config.jitter
     duration_s = config.t_nom_s if duration == "t_nom" else config.t_min * config.t_nom_s
     durations_s = np.full((n_skills, 1), duration_s)
-    drawn = generator(config.seed, "boundary", board)
-    token_s = tokens(gaps_of(jitter, 1.0), 0.0, max(lengths) * n_skills, plans, drawn)
+    rng = generator(config.seed, "boundary", board)
+    token_s = tokens(gaps_of(jitter, 1.0), 0.0, max(lengths) * n_skills, plans, rng)
     for length in lengths:
         unit_s = fragments(token_s[: length * n_skills], length)
         for rate in rates:

@@ -24,7 +24,7 @@ TTC_POLICY: Final[Any] = option(False, "add s2a-ttc: stream-to-act that starts b
 
 
 class CcrbDrives(PolicyOptions):
-    """What is driven; the defaults are an operating point with the paper's outcome."""
+    """The drives; the defaults are an operating point with the paper's outcome."""
 
     PANEL: ClassVar[str] = "Drives"
     closed_loop: ClassVar[bool] = False
@@ -49,11 +49,11 @@ class CcrbDrives(PolicyOptions):
         world = simulator_class(self.simulator)
         if self.scenario.lane_change and not world.steers:
             raise UsageError(f"`lane_change`: the {world.name} simulator knows one lane; take `simulator` embedded")
-        _ = self.chosen
+        _ = self.named_policies
         whole_s = self.board.prompt_s + self.tokens_per_skill * (self.scenario.n_skills + 1) / self.board.tokens_per_s
         if whole_s > LONG_S:
             raise UsageError(
-                f"{self.PACED_BY}: the whole plan takes {whole_s:.0f} s to arrive, which is no driving; "
+                f"{self.PACED_BY}: the whole plan takes {whole_s:.0f} s to arrive, which is too slow to drive; "
                 f"at most {LONG_S:.0f} s"
             )
 
@@ -106,13 +106,13 @@ class CcrbClosedLoop(CcrbModelled):
 class DrivingRequests(PlanRequests):
     """The requests for plans about the simulator's view; a replay plays the usual board unless another is named."""
 
-    def __init__(self, **given: Any) -> None:
-        engine = given.get("engine") or {}
+    def __init__(self, **values: Any) -> None:
+        engine = values.get("engine") or {}
         engine = engine.given_values() if isinstance(engine, Options) else engine
         name = engine.get("name", "")
         if name in ENGINES and ENGINES[name].plays and not engine.get("profile"):
-            given["engine"] = {**engine, "profile": BOARD}
-        super().__init__(**given)
+            values["engine"] = {**engine, "profile": BOARD}
+        super().__init__(**values)
 
 
 class CcrbRequested(CcrbDrives):
@@ -136,7 +136,7 @@ class CcrbRequested(CcrbDrives):
         return board_of_profile(load_profile(engine.profile or BOARD), NO_JITTER, None)
 
     def check(self) -> None:
-        check_steppers(self.chosen.values())
+        check_steppers(self.named_policies.values())
         self.requests.require_played(self.skill_set, (self.tokens_per_skill,), "`tokens_per_skill`")
         super().check()
 

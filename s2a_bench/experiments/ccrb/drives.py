@@ -46,7 +46,7 @@ class Prepared:
     policies: Mapping[str, Policy]
     schedules: Mapping[str, Schedule]
     late: bool | None = None
-    """Of s2a-ttc, if it is one of them."""
+    """Whether the roll-out of s2a-ttc is late, if it is one of the policies."""
 
     def with_ttc(self) -> Prepared:
         schedule, (late,) = ttc_aware(self.plans, self.scenario.deadline_s)

@@ -30,7 +30,7 @@ from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.session import Measured
 from s2a_bench.harness.timelines.cases import LearningPlan
-from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, PromptPlan, plan_requests
+from s2a_bench.harness.timelines.link import ModelRequests, PlanPrompt, PromptPlan, plan_requests
 from s2a_bench.harness.timelines.policies import prepare
 from s2a_bench.plan import Parser, load_skills
 from s2a_bench.policy import PlanShape, Policy
@@ -53,8 +53,6 @@ CRUISE_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class CcrbLivePlan:
-    """Drives on a model's tokens."""
-
     scenario: CcrbOptions
     requests: RunPlan
     prompt: PlanPrompt
@@ -63,7 +61,7 @@ class CcrbLivePlan:
 
 
 def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
-    """Decide what follows from a configuration, with the model's files; raises S2AError."""
+    """Derive the run plan from a configuration, with the model's files; raises S2AError."""
     scenario, tokens = config.scenario, config.tokens_per_skill
     prompts = PromptPlan([load_skills(config.skill_set)], [tokens], [scenario.skills])
     requests, (prompt,) = plan_requests(config.requests.but(seed=config.seed), prompts, progress)
@@ -73,7 +71,8 @@ def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
         follower_law=scenario.follower_law,
         seeds={"sampling": config.seed, "nonce": requests.feed.nonce},
     )
-    shape, learning = PlanShape(scenario.skills, tokens, scenario.durations), LearningPlan(config.chosen, config.seed)
+    shape = PlanShape(scenario.skills, tokens, scenario.durations)
+    learning = LearningPlan(config.named_policies, config.seed)
     return CcrbLivePlan(scenario, requests, prompt, shape, learning)
 
 
@@ -106,48 +105,48 @@ def _task(plan: CcrbLivePlan, world: Simulator, drive: Callable[[RunningLaunch],
 
 def _roll_out(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch, *, ttc: bool) -> None:
     """Request a plan, and drive it in virtual time."""
-    link = ModelLink(launch, plan.prompt, f"{world.name} simulator")
+    model = ModelRequests(launch, plan.prompt, f"{world.name} simulator")
     launch.progress.expect(launch.plan.blocks.warmup + 1)
-    policies = prepare(plan.learning, plan.shape, link.warm_up()).policies()
-    launch.progress.stage(f"{', '.join(policies)}: a plan over {link.cell.name}")
+    policies = prepare(plan.learning, plan.shape, model.warm_up()).policies()
+    launch.progress.stage(f"{', '.join(policies)}: a plan over {model.cell.name}")
     events: list[Event] = []
     feed = PlanFeed(Parser(plan.prompt.format), events.append)
-    measured = link.request(plan.prompt, 0, feed)
+    measured = model.request(plan.prompt, 0, feed)
     arrivals_ns = [event.at_ns for event in events if isinstance(event, SkillArrived)]
     arrivals = list(zip(arrivals_ns, plan.scenario.calls, strict=False))
     record = Record("", feed.requested_ns, feed.token_ns, arrivals)
-    ready = _arrived(plan, link, record, measured, policies)
+    ready = _arrived(plan, model, record, measured, policies)
     for table, rows in point_rows(ready.with_ttc() if ttc else ready, world):
-        link.writer.append(table, rows)
+        model.writer.append(table, rows)
     launch.progress.advance()
 
 
 def _close_loops(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch) -> None:
     view = world.camera(*PICTURE) if launch.recorder else None
-    link = ModelLink(launch, plan.prompt, f"{world.name} simulator")
+    model = ModelRequests(launch, plan.prompt, f"{world.name} simulator")
     launch.progress.expect(launch.plan.blocks.warmup + len(plan.learning.policies))
-    link.writer.update(step_s=world.step_s)
-    policies = prepare(plan.learning, plan.shape, link.warm_up()).policies()
+    model.writer.update(step_s=world.step_s)
+    policies = prepare(plan.learning, plan.shape, model.warm_up()).policies()
     for name, policy in policies.items():
-        launch.progress.stage(f"{name}: a plan over {link.cell.name}")
+        launch.progress.stage(f"{name}: a plan over {model.cell.name}")
         loop = ClosedLoop(plan.scenario, world, LiveInbox(), SystemClock(), view)
-        looped, measured = _close_loop(plan, link, loop, policy)
+        looped, measured = _close_loop(plan, model, loop, policy)
         if launch.recorder:
             _record(launch.recorder, name, loop.pictures, looped)
-        ready = _arrived(plan, link, looped.record, measured, {name: policy})
+        ready = _arrived(plan, model, looped.record, measured, {name: policy})
         for table, rows in loop_rows(ready, world, name, looped):
-            link.writer.append(table, rows)
+            model.writer.append(table, rows)
         launch.progress.advance()
 
 
-def _close_loop(plan: CcrbLivePlan, link: ModelLink, loop: ClosedLoop, policy: Policy) -> tuple[Looped, Measured]:
+def _close_loop(plan: CcrbLivePlan, model: ModelRequests, loop: ClosedLoop, policy: Policy) -> tuple[Looped, Measured]:
     """Let the cars drive, request a plan, and execute it as it arrives."""
     clock, feed = SystemClock(), PlanFeed(Parser(plan.prompt.format), loop.put)
     with quick_switching(), ThreadPoolExecutor(1, "world") as pool:
         running = pool.submit(loop.run, policy, plan.shape, plan.requests.timeout_s)
         try:
             clock.sleep_until_ns(clock.now_ns() + round(CRUISE_S * 1e9))
-            measured = link.request(plan.prompt, 0, feed)
+            measured = model.request(plan.prompt, 0, feed)
             return running.result(), measured
         except BaseException:
             loop.put(AbortRequested(now_ns(), "the run was ended"))
@@ -156,17 +155,17 @@ def _close_loop(plan: CcrbLivePlan, link: ModelLink, loop: ClosedLoop, policy: P
 
 
 def _arrived(
-    plan: CcrbLivePlan, link: ModelLink, record: Record, measured: Measured, policies: Mapping[str, Policy]
+    plan: CcrbLivePlan, model: ModelRequests, record: Record, measured: Measured, policies: Mapping[str, Policy]
 ) -> Prepared:
     """Schedule a received plan; raises TransportError if it is incomplete, or was not executed to its end."""
     plans, request_id = observed(record, plan.shape), measured.sample.request_id
     if plans is None or record.why:
         why = measured.sample.error or record.why or f"{len(record.arrivals)} of {plan.prompt.n_skills} skills arrived"
-        written = link.writer.path / "tokens.csv"
-        raise TransportError(f"{link.cell.name}: {why}; {written} has what the model wrote")
-    link.learn_rate(record.token_ns)
-    link.writer.update(requests={request_id: record.requested_ns})
-    setting = replace(link.setting(plan.prompt), t_nom_s=plan.scenario.durations.nominal_s)
+        written = model.writer.path / "tokens.csv"
+        raise TransportError(f"{model.cell.name}: {why}; {written} has what the model wrote")
+    model.learn_rate(record.token_ns)
+    model.writer.update(requests={request_id: record.requested_ns})
+    setting = replace(model.setting(plan.prompt), t_nom_s=plan.scenario.durations.nominal_s)
     return complete(plan.scenario, setting, request_id, plans, policies)
 
 

@@ -41,7 +41,7 @@ class CcrbPlan:
 
 
 def resolve(config: CcrbModelled) -> CcrbPlan:
-    """Decide what follows from a configuration; opens and starts nothing."""
+    """Derive the run plan from a configuration; opens and starts nothing."""
     scenario, board = config.scenario, config.board
     manifest = {
         "configuration": config.to_manifest(),
@@ -53,7 +53,7 @@ def resolve(config: CcrbModelled) -> CcrbPlan:
     }
     case = PlanCase.of(board, PlanShape(scenario.skills, config.tokens_per_skill, scenario.durations, 0.0))
     _, plans = draw(case, config.seed, 1, "plans")
-    policies = certain(config.chosen, board)
+    policies = certain(config.named_policies, board)
     ready = complete(scenario, case.setting, case.setting.request_id(0), plans, policies)
     return CcrbPlan(ready, manifest)
 

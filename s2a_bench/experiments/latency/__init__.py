@@ -1,4 +1,4 @@
-"""What each transport adds between a frame and its first token."""
+"""The experiment ``latency``: the time that each transport adds between a frame and its first token."""
 
 from s2a_bench.experiments import Experiment
 

@@ -117,9 +117,9 @@ def document(
     prompt_s = max(0.0, float(ttft.mean()) - mean_s)
     spread = float(ttft.std(ddof=1)) if len(ttft) > 1 else 0.0
     board = board_facts()
-    known = environment.collect()
+    machine = environment.collect()
     return {
-        "title": config.title or str(board.get("model") or board.get("gpu") or board.get("cpu") or known["host"]),
+        "title": config.title or str(board.get("model") or board.get("gpu") or board.get("cpu") or machine["host"]),
         "origin": "measured",
         "tokens_per_s": 1 / mean_s,
         "prompt_s": prompt_s,
@@ -144,7 +144,7 @@ def document(
             "distance_gap": {name: round(gap, 4) for name, (gap, _) in fit.distances.items()},
             "distance_sum": {name: round(total, 4) for name, (_, total) in fit.distances.items()},
         },
-        "environment": {key: value for key, value in known.items() if key not in {"cpu", "board", "governor"}},
+        "environment": {key: value for key, value in machine.items() if key not in {"cpu", "board", "governor"}},
         "trace": {
             "warmups": config.warmup,
             "ttft_ns": [answer.ttft_ns for answer in recorded],

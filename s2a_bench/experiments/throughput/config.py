@@ -63,14 +63,14 @@ class ThroughputConfig(FirstVariants):
         risk="program",
     )
 
-    def __init__(self, **given: Any) -> None:
+    def __init__(self, **values: Any) -> None:
         """Replace the engine `TWIN` by the transports `TWINS`; raises UsageError naming the field."""
-        engine = given.get("engine")
+        engine = values.get("engine")
         if isinstance(engine, Mapping) and engine.get("name") == TWIN:
-            if "transports" in given:
+            if "transports" in values:
                 raise UsageError(f"`engine` {TWIN} is `transport` {','.join(TWINS)}; leave one of them out")
-            given = {**given, "engine": {**engine, "name": MODEL}, "transports": TWINS}
-        super().__init__(**given)
+            values = {**values, "engine": {**engine, "name": MODEL}, "transports": TWINS}
+        super().__init__(**values)
 
     @field_validator("engine", mode="before")
     @classmethod
@@ -90,8 +90,8 @@ class ThroughputConfig(FirstVariants):
     @property
     def greedy(self) -> bool:
         """Whether sampling is greedy: by default with a reference, which samples nothing."""
-        chosen = "sampling" in self.engine.model_fields_set or self.reference is None
-        return self.engine.sampling == "greedy" if chosen else True
+        by_user = "sampling" in self.engine.model_fields_set or self.reference is None
+        return self.engine.sampling == "greedy" if by_user else True
 
     @property
     def reads_model(self) -> bool:

@@ -1,4 +1,4 @@
-"""What each policy makes of streamed skills: computed, played in real time, or live."""
+"""The experiment ``timeline``: streamed skills under each policy, computed, played in real time, or live."""
 
 from s2a_bench.experiments import Experiment, RunMode
 

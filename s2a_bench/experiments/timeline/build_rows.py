@@ -36,7 +36,7 @@ def timeline_rows(
     cautions: Sequence[float | None] | None = None,
     tolerance_s: float = ANY_STALL_S,
 ) -> list[TimelineRow]:
-    """Return the rows of M timelines; gaps up to ``tolerance_s`` are no stall for ``any_stall``.
+    """Return the rows of M timelines; gaps up to ``tolerance_s`` do not count for ``any_stall``.
 
     ``cautions`` has a lambda for each plan. Motion is computed for plans below `KEPT_PLANS`.
     """

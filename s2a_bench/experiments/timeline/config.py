@@ -60,7 +60,7 @@ class TimelineOptions(PolicyOptions):
         return Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
 
     def check(self) -> None:
-        if self.track and not any(each.learns and each.caution is None for each in self.chosen.values()):
+        if self.track and not any(each.learns and each.caution is None for each in self.named_policies.values()):
             raise UsageError("`track`: no policy has a lambda to follow; take stream-to-act without caution")
 
 
@@ -122,16 +122,16 @@ class TimelineComputed(TimelineOptions):
         if self.calibrate is not None and len(self.boards) != 1:
             raise UsageError("`calibrate`: the recorded machine is one board; name it with one `profiles` or `rates`")
         plans = self.plans_a_cell
-        for name, given in (("track", self.track), ("plans", plans > 1)):
-            if given and not self.random:
+        for name, value in (("track", self.track), ("plans", plans > 1)):
+            if value and not self.random:
                 raise UsageError(f"`{name}`: without `jitter` or `t_nom_cv` all plans are the same; leave it out")
-        skills = sum(case.shape.n_skills for case in self.cases) * len(self.chosen) * plans
+        skills = sum(case.shape.n_skills for case in self.cases) * len(self.named_policies) * plans
         if skills > MOST_SKILLS:
             raise UsageError(f"`plans`: {skills} skills are more than the {MOST_SKILLS} of one run; ask for fewer")
         tokens = max(case.tokens for case in self.cases)
-        if (drawn := tokens * max(plans, self.calibration_plans)) > MOST_TOKENS:
+        if (total := tokens * max(plans, self.calibration_plans)) > MOST_TOKENS:
             raise UsageError(
-                f"`n_skills`, `tokens_per_skill`: {tokens} tokens a plan, {drawn} a cell: {MOST_TOKENS} is the most"
+                f"`n_skills`, `tokens_per_skill`: {tokens} tokens a plan, {total} a cell: {MOST_TOKENS} is the most"
             )
 
     def to_manifest(self) -> dict[str, Any]:
@@ -172,8 +172,8 @@ class TimelineLive(TimelineOptions):
         if "epsilon" in self.model_fields_set and not self.track:
             raise UsageError("`epsilon`: no policy is calibrated before a live run; it needs `track`")
         _ = self.skill_set
-        check_steppers(self.chosen.values())
-        if not kind(self.robot, SkillKind).several and len(self.chosen) > 1:
+        check_steppers(self.named_policies.values())
+        if not kind(self.robot, SkillKind).several and len(self.named_policies) > 1:
             raise UsageError(f"`robot`: {self.robot} follows one policy at a time; choose it with `policies`")
         self.requests.require_played(self.skills, self.tokens_per_skill, "`skills` and `tokens_per_skill`")
 

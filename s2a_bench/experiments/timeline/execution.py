@@ -103,8 +103,8 @@ def jitter_facts(records: Sequence[Record]) -> dict[str, float | int]:
     values = [skill.jitter_ns / 1e6 for record in records for skill in record.skills]
     if not values:
         return {}
-    found = summarise(values)
-    return {"starts": found.n, "median_ms": found.median, "p99_ms": found.p99}
+    summary = summarise(values)
+    return {"starts": summary.n, "median_ms": summary.median, "p99_ms": summary.p99}
 
 
 def _facts(record: Record) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.timelines.cases import LearningPlan
-from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, PromptPlan, plan_requests
+from s2a_bench.harness.timelines.link import ModelRequests, PlanPrompt, PromptPlan, plan_requests
 from s2a_bench.harness.timelines.policies import Following, prepare
 from s2a_bench.plan import Parser, SkillSet
 from s2a_bench.progress import Progress, watching
@@ -34,8 +34,6 @@ from s2a_bench.store.requests import SKILLS
 
 @dataclass(frozen=True, slots=True)
 class LivePlan:
-    """A run of timelines on a model's plans."""
-
     requests: RunPlan
     prompts: Sequence[PlanPrompt]
     learning: LearningPlan
@@ -44,7 +42,7 @@ class LivePlan:
 
 
 def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
-    """Decide what follows from a configuration, with the model's files; raises S2AError."""
+    """Derive the run plan from a configuration, with the model's files; raises S2AError."""
     plans = prompt_plan(config)
     requests, prompts = plan_requests(config.requests.but(seed=config.seed), plans, progress)
     engine = {"engine": requests.engine.to_manifest()}
@@ -52,17 +50,17 @@ def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
         configuration={**requests.manifest["configuration"], **config.to_manifest(), **engine},
         seeds={"sampling": config.seed, "source": config.seed, "nonce": requests.feed.nonce},
     )
-    learning = LearningPlan(config.chosen, config.seed, config.epsilon, config.track)
+    learning = LearningPlan(config.named_policies, config.seed, config.epsilon, config.track)
     return LivePlan(requests, prompts, learning, config.robot, config.skill_set)
 
 
 def prompt_plan(config: TimelineLive) -> PromptPlan:
     skills = config.skill_set
-    given = [
+    prompts = [
         replace(skills, skills=tuple(replace(each, durations=config.lasting(t_nom_s)) for each in skills.skills))
         for t_nom_s in config.t_nom_s
     ]
-    return PromptPlan(given or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
+    return PromptPlan(prompts or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
 
 
 def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:
@@ -81,23 +79,23 @@ def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:
 
 
 def _drive(plan: LivePlan, robots: Sequence[SkillRobot], launch: RunningLaunch) -> None:
-    link, records, progress = ModelLink(launch, plan.prompts[0], plan.robot), list[Record](), launch.progress
+    model, records, progress = ModelRequests(launch, plan.prompts[0], plan.robot), list[Record](), launch.progress
     blocks = launch.plan.blocks
     progress.expect(blocks.warmup + len(plan.prompts) * blocks.requests)
     try:
-        prior = link.warm_up()
+        prior = model.warm_up()
         for ask in plan.prompts:
             following = prepare(plan.learning, ask.shape, prior)
             for number in range(blocks.requests):
-                _execute(link, ask, number, following, robots, records)
+                _execute(model, ask, number, following, robots, records)
                 progress.advance()
-        link.compare()
+        model.compare()
     finally:
         launch.writer.update(start_jitter=jitter_facts(records))
 
 
 def _execute(
-    link: ModelLink,
+    model: ModelRequests,
     ask: PlanPrompt,
     plan: int,
     following: Following,
@@ -105,20 +103,20 @@ def _execute(
     records: list[Record],
 ) -> None:
     """Request one plan, execute it under every policy as it arrives, and extend ``records``."""
-    policies, progress = following.policies(), link.launch.progress
-    skill_s = (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.shape.expected.nominal_s
+    policies, progress = following.policies(), model.launch.progress
+    skill_s = (ask.tokens_per_skill / model.rate if model.rate else 0.0) + ask.shape.expected.nominal_s
     span_s = ask.n_skills * skill_s
-    progress.stage(f"{link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
-    side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.launch.plan.timeout_s)
+    progress.stage(f"{model.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
+    side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, model.launch.plan.timeout_s)
     feed = PlanFeed(Parser(ask.format), side_by_side.send)
-    paced = [f"paced to {link.pace:g} tokens/s"] if link.pace else []
-    remarks = [*paced, *(label for label in link.origin.labels if label != "paced")]
-    title = ", ".join((f"live {link.cell.name}", f"L = {ask.tokens_per_skill}", *remarks))
+    paced = [f"paced to {model.pace:g} tokens/s"] if model.pace else []
+    remarks = [*paced, *(label for label in model.origin.labels if label != "paced")]
+    title = ", ".join((f"live {model.cell.name}", f"L = {ask.tokens_per_skill}", *remarks))
     request_id = ""
     try:
         with side_by_side, watching(progress, Scene(title, side_by_side.records, ask.n_skills, span_s)):
             try:
-                request_id = link.request(ask, plan, feed).sample.request_id
+                request_id = model.request(ask, plan, feed).sample.request_id
             except S2AError as error:  # the run ends after the current skills
                 side_by_side.send(StreamBroke(now_ns(), "stream-error", f"{type(error).__name__}: {error}"))
                 side_by_side.finish()
@@ -127,6 +125,6 @@ def _execute(
     finally:  # also after an interruption
         executed = side_by_side.records
         records += executed
-        link.learn_rate(max((record.token_ns for record in executed), key=len))
-        link.launch.warnings.extend(keep(link.writer, link.setting(ask), plan, request_id, policies, executed))
+        model.learn_rate(max((record.token_ns for record in executed), key=len))
+        model.launch.warnings.extend(keep(model.writer, model.setting(ask), plan, request_id, policies, executed))
     following.learn(side_by_side.records)

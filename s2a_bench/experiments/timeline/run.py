@@ -51,7 +51,7 @@ class ModelledPlan:
 
 
 def resolve(config: TimelineComputed) -> ModelledPlan:
-    """Decide what follows from a configuration; raises S2AError for recorded answers that are missing or too short."""
+    """Derive the run plan from a configuration; raises S2AError for recorded answers that are missing or too short."""
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
@@ -60,7 +60,7 @@ def resolve(config: TimelineComputed) -> ModelledPlan:
         "provenance": _origins(config).to_manifest(),
     }
     learning = LearningPlan(
-        policies=config.chosen,
+        policies=config.named_policies,
         seed=config.seed,
         epsilon=config.epsilon,
         track=config.track,
@@ -100,7 +100,7 @@ def computed_rows(
     """Decide plans under every policy, and yield their rows for each table."""
     request_ids = [setting.request_id(plan) for plan in range(token_s.shape[1])]
     yield TOKENS, token_rows(setting.name, token_s, request_ids)
-    for name, policy in following.made.items():
+    for name, policy in following.by_name.items():
         if name in following.tracked:
             followed, schedule = following.tracked[name].follow(plans)
             cautions = [finite(float(caution)) for caution in followed]
@@ -113,7 +113,7 @@ def computed_rows(
 
 def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
     """Return where stream-to-act could not be calibrated well."""
-    waits = [name for name, found in calibrations.items() if found["caution"] is None]
+    waits = [name for name, calibration in calibrations.items() if calibration["caution"] is None]
     waiting = RunWarning(
         "calibration-waits",
         f"stream-to-act waits for the whole plan in {', '.join(waits)}: no smaller lambda kept stalls rare enough",
@@ -232,7 +232,7 @@ def _origins(config: TimelineComputed) -> Origins:
     cells = {
         name: replace(case.board.provenance, clock=clock)
         for case in config.cases
-        for name in (case.setting.name, *(f"{case.setting.name}/{policy}" for policy in config.chosen))
+        for name in (case.setting.name, *(f"{case.setting.name}/{policy}" for policy in config.named_policies))
     }
     return Origins(next(iter(cells.values()), Provenance()), cells)
 

@@ -58,7 +58,6 @@ def draw(scene: Scene, at_ns: int, width: int) -> Group:
 
 
 def summary(record: Record) -> str:
-    """Return how a plan ended, as text."""
     stalls = _stalls_s(record)
     if not record.skills or record.requested_ns is None:
         return f"{record.outcome}, nothing was started" + (f": {record.why}" if record.why else "")
@@ -133,7 +132,7 @@ def _stalls_s(record: Record) -> list[float]:
     return [stall / 1e9 for stall in record.stalls_ns if stall > TOLERANCE_S * 1e9]
 
 
-def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:
+def _scale(axis: _Axis, safe_s: float | None, complete: bool) -> Text:
     """Return the time axis with S0, in brackets until the whole plan has arrived."""
     cells = [" "] * axis.columns
     step = next(
@@ -142,7 +141,7 @@ def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:
     )
     marks = [(step * place, f"{step * place:g}") for place in range(int(axis.span_s / step) + 1)]
     if safe_s is not None:  # first, so that it replaces a number too near
-        marks.insert(0, (safe_s, "S0" if known else "(S0)"))
+        marks.insert(0, (safe_s, "S0" if complete else "(S0)"))
     for at_s, text in marks:
         column = min(axis.column(at_s), axis.columns - len(text))
         if not "".join(cells[max(column - 1, 0) : column + len(text) + 1]).strip():
@@ -152,12 +151,12 @@ def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:
 
 def _safe_s(record: Record) -> float | None:
     """Return S0 of the skills so far; None before the first."""
-    found, before_s = None, 0.0
+    safe_s, before_s = None, 0.0
     for at_ns, call in list(record.arrivals):
         at_s = (at_ns - (record.requested_ns or 0)) / 1e9
-        found = at_s - before_s if found is None else max(found, at_s - before_s)
+        safe_s = at_s - before_s if safe_s is None else max(safe_s, at_s - before_s)
         before_s += call.skill.durations.nominal_s
-    return found
+    return safe_s
 
 
 def _end_s(record: Record) -> float:

@@ -1,1 +1,1 @@
-"""Runs of plans, drawn or live: their options, the requests for plans, and the knowledge of policies."""
+"""Runs of answer plans, drawn or live: their options, the requests for them, and what policies learn."""

@@ -1,4 +1,4 @@
-"""The parts of a run of plans: its cases, each with a board and a shape, and what policies learn before them."""
+"""The parts of a run of answer plans: its cases, each with a board and a shape, and what policies learn from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_CV: Final = 3**-0.5
 
 @dataclass(frozen=True, slots=True)
 class PlanSetting:
-    """The parameters of plans, without the policy."""
+    """The parameters of answer plans, without the policy."""
 
     board: str
     """A profile's name; empty for a bare rate."""
@@ -29,6 +29,7 @@ class PlanSetting:
     n_skills: int
     t_nom_s: float
     mode: str = "virtual"
+    """The run mode: virtual or live."""
     emulated: bool = True
 
     @property
@@ -38,7 +39,7 @@ class PlanSetting:
 
     @property
     def key(self) -> Verbatim:
-        """Return what its draws follow from: another field, or another name of one, is another draw."""
+        """Return the fields that seed the draws; renaming one changes them."""
         values = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self))
         return Verbatim(f"Setting({values})")  # a name in the seeds of all published runs
 

@@ -1,4 +1,4 @@
-"""The options that runs of plans share: which policies, and the requests for plans of a model."""
+"""The options that runs of answer plans share: the policies, and the requests for plans of a model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PolicyOptions(Options):
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
     @cached_property
-    def chosen(self) -> dict[str, Policy]:
+    def named_policies(self) -> dict[str, Policy]:
         return policies(self.policies)
 
 
@@ -39,10 +39,7 @@ class PlanRequests(FirstVariants):
     COMPUTES: ClassVar[str] = "a plan takes a model's time"
 
     transports: Names = option(
-        (FOLLOWED,),
-        "ros, ros/action, http, http/VARIANT, loopback: one, as in latency",
-        flag="transport",
-        names=paths,
+        (FOLLOWED,), "ros, ros/action, http, http/VARIANT, loopback: one, as in latency", flag="transport", names=paths
     )
     engine: EngineConfig = group(
         EngineConfig,
@@ -77,7 +74,7 @@ class PlanRequests(FirstVariants):
             )
 
 
-def check_steppers(chosen: Iterable[Policy]) -> None:
+def check_steppers(policies: Iterable[Policy]) -> None:
     """Raise UsageError for a policy that cannot follow a plan as it arrives."""
-    for policy in chosen:
+    for policy in policies:
         policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Requests for plans: their prompts, the run's session with a model, and its warm-up."""
+"""Requests for answer plans: their prompts, the run's session with a model, and its warm-up."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PlanPrompt:
 
 @dataclass(frozen=True, slots=True)
 class PromptPlan:
-    """The plans that a run requests: a prompt for each length, number of skills and skill set."""
+    """The answer plans that a run requests: a prompt for each length, number of skills and skill set."""
 
     skill_sets: Sequence[SkillSet]
     """One skill set, a copy for each duration of its skills."""
@@ -72,7 +72,7 @@ class PromptPlan:
 
 
 def plan_requests(requests: PlanRequests, plan: PromptPlan, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
-    """Plan requests of sufficient length, find the model's files, and write the prompts; raises S2AError."""
+    """Return the run plan of long enough requests, with the model's files, and the prompts; raises S2AError."""
     limit_threads()
     run = resolve(requests, progress.say)
     tokenize: Tokenize | None = None
@@ -103,19 +103,19 @@ def write_prompts(plan: PromptPlan, tokenize: Tokenize | None, *, exact: bool) -
 
 
 @dataclass
-class ModelLink:
+class ModelRequests:
     """The requests of one run to one model."""
 
     launch: RunningLaunch
     first: PlanPrompt
     """The prompt of the warm-up requests."""
     robot: str
-    """For the manifest."""
+    """The robot's entry in the manifest."""
     blocks: Iterator[int] = field(default_factory=count)
     learned_ms: list[Floats] = field(default_factory=list)
     """Gaps between tokens of each warm-up, from which policies learn."""
     seen_ms: list[Floats] = field(default_factory=list)
-    """Those of each plan."""
+    """The observed delays of each plan."""
 
     def __post_init__(self) -> None:
         (self.session,) = self.launch.sessions

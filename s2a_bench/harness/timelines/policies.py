@@ -1,4 +1,4 @@
-"""The knowledge of policies: of a board's tokens before the first one, and from plan to plan in executed runs."""
+"""Learning of policies: from a board's tokens before the first plan, and from plan to plan in executed runs."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class Following:
     """The policies of one case by name, prepared for its plans."""
 
     shape: PlanShape
-    made: dict[str, Policy]
+    by_name: dict[str, Policy]
     tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
     calibrations: dict[str, Calibration] = field(default_factory=dict)
 
     @property
     def unset(self) -> dict[str, Policy]:
         """Return the policies whose lambda is not set."""
-        return {name: policy for name, policy in self.made.items() if policy.learns and policy.caution is None}
+        return {name: policy for name, policy in self.by_name.items() if policy.learns and policy.caution is None}
 
     def policies(self) -> dict[str, Policy]:
-        return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
+        return {**self.by_name, **{name: each.policy for name, each in self.tracked.items()}}
 
     def learn(self, records: Sequence[Record]) -> None:
         """Learn from the records of an executed plan; an incomplete one is ignored."""
@@ -74,8 +74,9 @@ def learn(case: PlanCase, plan: LearningPlan) -> Following:
     following = Following(case.shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
     for name, policy in following.unset.items():
         score = scores(policy, plans)
-        chosen = choose(score, plan.epsilon, plan.guarantee, plans.arrival_s[-1])
-        following.calibrations[name], following.made[name] = chosen, policy.informed(caution=chosen.caution)
+        calibration = choose(score, plan.epsilon, plan.guarantee, plans.arrival_s[-1])
+        following.calibrations[name] = calibration
+        following.by_name[name] = policy.informed(caution=calibration.caution)
         if plan.track:
             following.tracked[name] = TrackedPolicy(policy, Tracker(score, plan.epsilon))
     return following
@@ -94,10 +95,10 @@ def prepare(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Fol
     following = Following(shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
     for name, policy in following.unset.items():
         if plan.track:
-            plans = drawn(policy.prior, shape, generator(plan.seed, "tracking", shape.key), PLANS)
+            plans = draw_plans(policy.prior, shape, generator(plan.seed, "tracking", shape.key), PLANS)
             following.tracked[name] = TrackedPolicy.begin(policy, plans, plan.epsilon)
         else:
-            following.made[name] = policy.informed(caution=CAUTION)
+            following.by_name[name] = policy.informed(caution=CAUTION)
     return following
 
 
@@ -121,7 +122,7 @@ def draw(case: PlanCase, seed: int, plans: int, purpose: str) -> tuple[Floats, P
     return token_s, with_skills(token_s, case.shape, rng)
 
 
-def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:
+def draw_plans(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:
     """Draw plans of a prior: lognormal rates and gaps, uniform durations."""
 
     def lognormal(cv: float, *size: int) -> Any:

@@ -61,7 +61,7 @@ def write_dummy(
     family = FAMILIES[like]
     shape, files = family.shapes[size], dummy_files(folder, size, quant, like=like)
     vocab = make_vocab(full=size == "full", size=family.vocab, special=family.special)
-    texts = vocab.texts() if size == "tiny" else ()  # half of its few tokens are no text
+    texts = vocab.texts() if size == "tiny" else ()  # half of its few tokens have no text
     tensors = list(model_tensors(family, shape, len(vocab.tokens), quant, texts))
     done, total = 0, sum(tensor.nbytes for tensor in (*tensors, *mmproj_tensors(family, shape, shape.width)))
 

@@ -18,7 +18,7 @@ from s2a_bench.inference.dummy.tensors import Kind, Tensor
 from s2a_bench.inference.dummy.vocab import FULL_SIZE, SPECIAL, Vocab
 
 _NEVER = -1e4
-"""Added to the logits of tokens that are no text: servers send nothing for those, so that the first would be late."""
+"""Added to the logits of tokens without text: servers send nothing for those, so that the first would be late."""
 _SHARP = 10
 """Spread of the logits of texts where no architecture adds a bias: the other tokens' rows are 0, hence their logits."""
 _QUERIES = 64

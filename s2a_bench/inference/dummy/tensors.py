@@ -53,8 +53,8 @@ class Tensor:
             blocks = left if self.blank else min(left, PART_BYTES // size)
             left -= blocks
             if self.value is None:
-                drawn = generator.integers(0, 2**64 - 1, -(-blocks * size // 8), np.uint64, endpoint=True)
-                part = draw(drawn.view(np.uint8)[: blocks * size], self.spread)
+                words = generator.integers(0, 2**64 - 1, -(-blocks * size // 8), np.uint64, endpoint=True)
+                part = draw(words.view(np.uint8)[: blocks * size], self.spread)
                 if self.blank:  # bytes of 0 are numbers of 0 in every type
                     part.reshape(self.shape[0], -1)[self.blank] = 0
                 yield part

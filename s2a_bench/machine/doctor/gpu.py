@@ -128,10 +128,10 @@ def current_power_mode(machine: Machine) -> tuple[str, dict[str, str]] | None:
 
 def power_mode(machine: Machine) -> Finding | None:
     """Report a Jetson's power mode; one below MAXN may be intended, and is part of the result."""
-    known = current_power_mode(machine)
-    if known is None:
+    current = current_power_mode(machine)
+    if current is None:
         return None
-    name, modes = known
+    name, modes = current
     if name.startswith(FULL_POWER):
         return Finding("power-mode", "state", name)
     full = next((number for number, mode in modes.items() if mode.startswith(FULL_POWER)), "0")

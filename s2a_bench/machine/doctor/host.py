@@ -186,10 +186,10 @@ def clock_source(machine: Machine) -> Finding | None:
 def memory(machine: Machine) -> Finding | None:
     """Compare the available memory, also of this cgroup, with the need of the full model."""
     lines = (machine.read("proc/meminfo") or "").splitlines()
-    known = {name: int(rest.split()[0]) * 1024 for name, _, rest in (line.partition(":") for line in lines) if rest}
-    if "MemAvailable" not in known:
+    sizes = {name: int(rest.split()[0]) * 1024 for name, _, rest in (line.partition(":") for line in lines) if rest}
+    if "MemAvailable" not in sizes:
         return None
-    total, available = known.get("MemTotal", 0), known["MemAvailable"]
+    total, available = sizes.get("MemTotal", 0), sizes["MemAvailable"]
     limit = machine.read("sys/fs/cgroup/memory.max") or machine.read("sys/fs/cgroup/memory/memory.limit_in_bytes") or ""
     bounded = limit.isdecimal() and int(limit) < total
     usable = min(available, int(limit)) if bounded else available

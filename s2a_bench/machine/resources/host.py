@@ -64,7 +64,7 @@ class HostMemory(Reader):
         if self._pids:
             sources["server_rss_bytes"] = lambda: sum(self._rss(str(pid)) for pid in self._pids)
         for name, source in sources.items():
-            with suppress(OSError, LookupError, ValueError, ZeroDivisionError):
+            with suppress(OSError, LookupError, ValueError, ZeroDivisionError):  # then it is absent
                 values[name] = source()
         return values
 

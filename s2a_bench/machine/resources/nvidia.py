@@ -114,7 +114,7 @@ class Tegrastats(Reader):
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - the whole board's
         program = shutil.which("tegrastats")
         if program is None:
-            raise Unreadable("no tegrastats: this is no Jetson, or the program is not in the container")
+            raise Unreadable("no tegrastats: this is not a Jetson, or the program is not in the container")
         self.about = f"{program} every {INTERVAL_MS} ms"
         self._text = b""
         self._process = subprocess.Popen(  # noqa: S603 - found above

@@ -26,7 +26,7 @@ from s2a_bench.types import Encoding, Pixels
 
 CONNECT_S: Final = 10.0
 ROAD_M, ORIGIN_M, END_M, MIDDLE_M, DROP_M = 1500.0, 250.0, 10.0, 1.5 * LANE_WIDTH_M, 0.3
-"""On x: the road, its position 0, the margin at its ends. On y, to the right: their lane. On z: they settle from it."""
+"""The road in x, its position 0 and the margin at its ends; the cars' lane in y; the height from which they settle."""
 LANE: Final = f"""
 <lane id="{{}}" type="driving" level="false"><width sOffset="0" a="{LANE_WIDTH_M}" b="0" c="0" d="0"/>
 <roadMark sOffset="0" type="{{}}" weight="standard" color="standard" width="0.15"/></lane>"""

@@ -19,7 +19,7 @@ from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
 from s2a_bench.types import Frame, Pixels, Vector
 
 CLIENTS: Final = 4
-"""Of a cell, for modes with several concurrent requests."""
+"""The clients of a cell, for acting modes with several concurrent requests."""
 KEEP_S: Final = 0.05
 """Period in which measurements are written while the loop runs."""
 WARM_UP_TICK_NS: Final = 20_000_000
@@ -51,7 +51,7 @@ def warm_up(
 
 
 def act(
-    chosen: Mode,
+    mode: Mode,
     setting: ControlSetting,
     sessions: Sequence[Session],
     launch: RunningLaunch,
@@ -75,9 +75,9 @@ def act(
         if isinstance(robot, TaskRobot) and robot.over and not warmup:
             acting.finish()
 
-    acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
+    acting = RobotTicks(mode, setting, send, request_chunk, ticks)
     seed = launch.plan.blocks.seed
-    requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
+    requester = ChunkRequester(sessions, setting.horizon, seed, mode.streams, acting.arrived, blocks, warmup)
     loop = ControlLoop([acting])
     with requester.running():
         try:
@@ -88,13 +88,12 @@ def act(
                 launch.progress.stage("waiting for the last answer")
         finally:
             loop.stop()
-    _keep(requester, launch)
+    _keep(requester, launch)  # first, as `join` raises the loop's error
     loop.join()
     return acting, requester
 
 
 def frame_of(pixels: Pixels, index: int, stamp_ns: int) -> Frame:
-    """Return a robot's picture as the frame of a request."""
     height, width, _ = pixels.shape
     return Frame(index, stamp_ns, width, height, "rgb8", pixels)
 

@@ -30,7 +30,7 @@ RequestChunk: TypeAlias = "Callable[[int, int], None]"
 ENDLESS: Final = 2**62
 """Ticks of a loop that is stopped."""
 HEAD_START_NS: Final = 20_000_000
-"""From `ControlLoop.start` to the first tick."""
+"""Time from `ControlLoop.start` to the first tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,13 +89,13 @@ class RobotTicks:
         return self._start_ns
 
     def step(self, begins_ns: int, clock: Clock) -> int | None:
-        """Make the tick that begins at ``begins_ns`` and return when the next one does; None after the last."""
+        """Execute the tick that begins at ``begins_ns`` and return when the next one does; None after the last."""
         woke_ns, tick, floor = clock.now_ns(), self._tick, self._setting.rounding == "floor"
         if floor and tick:
             self._deliver(begins_ns, tick - 1)
             self._act(tick - 1, begins_ns, clock)
         if tick < self._ticks:
-            self._deliver(begins_ns + 1, tick)
+            self._deliver(begins_ns + 1, tick)  # what arrives just as a tick begins is known in it
             if self.stepper.ask(tick):
                 self._request_ticks.append(tick)
                 self._ask(len(self._request_ticks) - 1, tick)
@@ -125,6 +125,7 @@ class RobotTicks:
 
     def acted(self) -> Acted:
         """Return the record so far; while the loop runs, that of the ticks that have ended."""
+        # Copies, since the loop may append meanwhile.
         acts, horizon = np.array(self._acts[:], np.int64).reshape(-1, 3), self._setting.horizon
         request_tick = np.array(self._request_ticks[:], np.int64)
         arrival_ns = np.full((request_tick.size, horizon), -1)
@@ -138,7 +139,7 @@ class RobotTicks:
 
     def _deliver(self, before_ns: int, tick: int) -> None:
         """Pass the stepper what had arrived before a time; the next call passes what was delivered late."""
-        for _ in range(len(self._inbox)):
+        for _ in range(len(self._inbox)):  # those of now: other threads add to them
             at_ns, request, count = self._inbox.popleft()
             if at_ns < before_ns:
                 self.stepper.arrived(request, count, tick)

@@ -43,7 +43,7 @@ class Source:
     requests: tuple[Mapping[str, object], ...] = ()
     """Measured requests, as the columns of `COLUMNS`."""
     service_ns: Ints | None = None
-    """Of measured requests, as `service_of`: shape (R, 3)."""
+    """Service times of measured requests, as `service_of`: shape (R, 3)."""
 
     @property
     def provenance(self) -> Provenance:

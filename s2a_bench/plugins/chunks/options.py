@@ -43,7 +43,7 @@ def acting_over() -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class ControlPlan:
-    """How robots act: in modes, by their canonical names, under one control clock."""
+    """The acting modes of the robots, by their canonical names, under one control clock."""
 
     setting: ControlSetting
     modes: Mapping[str, Mode]
@@ -73,7 +73,7 @@ class ControlOptions(Options):
         self.check_modes()
 
     def check_modes(self) -> None:
-        """Raise UsageError for a mode that is none, or that cannot act so."""
+        """Raise UsageError for an unknown acting mode, and for one that cannot act so."""
         _ = self.control
 
     def to_manifest(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class ServedOptions(ControlOptions):
 
     @property
     def answer(self) -> str:
-        """What the server answers with."""
+        """The kind of the server's answers."""
         return ACTIONS
 
     @cached_property

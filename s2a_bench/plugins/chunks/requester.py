@@ -21,7 +21,7 @@ OnActions: TypeAlias = Callable[[int, Sequence[Vector], int], None]
 
 SEEDS: Final = 2**31
 GRACE_S: Final = 1.0
-"""For answers in progress when a run ends early."""
+"""Time for answers in progress when a run ends early."""
 LEAST_WAIT_S: Final = 0.1
 MOST_WAIT_S: Final = 5.0
 """The longest wait for a server that names a time to retry."""
@@ -69,7 +69,7 @@ class ChunkRequester:
     """Request -> the id of its sample."""
     attempts: int = 0
     error: str = ""
-    """Of the last attempt."""
+    """The error of the last attempt."""
     dims: int = 0
     """Numbers of an action; 0 before the first."""
     sent_bytes: int = 0

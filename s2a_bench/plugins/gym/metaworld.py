@@ -18,7 +18,7 @@ def _experts() -> Any:
 def expert(pictures: tuple[Pixels, ...], state: Vector, prompt: str) -> Any:  # noqa: ARG001 - it knows the state
     """Return one action, float32 (4,)."""
     if prompt not in _experts():
-        raise ValueError(f"prompt '{prompt}' is no task of Meta-World, as push-v3")
+        raise ValueError(f"prompt '{prompt}' is not a task of Meta-World, as push-v3")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # most experts ask for more than 1, which is clipped
         return _experts()[prompt]().get_action(state)

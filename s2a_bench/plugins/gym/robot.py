@@ -31,7 +31,7 @@ class Gym(TaskKind):
     """The environment ``env``, or PACKAGE:ID of a package that registers it when it is imported.
 
     Other parameters are keywords of ``gymnasium.make``. ``state`` and ``picture`` are keys of the observation; by
-    default the state is all of it, and the picture is rendered; ``none`` is no picture. An episode ends with the
+    default the state is all of it, and the picture is rendered; ``none`` sends no picture. An episode ends with the
     environment's, or at a success: ``info`` is the environment's word, ``terminated`` its end, ``survival`` none before
     its limit of steps, ``return`` a sum of rewards of ``least``. Before the first action it takes the neutral one, the
     nearest to 0; in a ``stall`` that, or the last action again. ``position=state[0:3]`` is what jerk and path are of,
@@ -65,7 +65,7 @@ class Gym(TaskKind):
     def open_actions(self, dims: int, period_ns: int) -> GymRobot:  # noqa: ARG002 - the environment knows
         return GymRobot(self, period_ns)
 
-    def made(self) -> Any:
+    def make_env(self) -> Any:
         """Make the environment; raises S2AError."""
         gymnasium = extras.require("gymnasium", "gym")
         gymnasium.logger.min_level = gymnasium.logger.ERROR
@@ -92,9 +92,9 @@ class Gym(TaskKind):
 def _period(env: Any) -> tuple[int, str] | None:
     """Return the period of an environment in ns, and where that is written; None: nowhere."""
     rate = env.metadata.get("render_fps")
-    known = {name: getattr(env.unwrapped, name, None) for name in ("dt", "tau")}
-    known["render_fps"] = 1 / rate if rate else None
-    for name, period_s in known.items():
+    periods_s = {name: getattr(env.unwrapped, name, None) for name in ("dt", "tau")}
+    periods_s["render_fps"] = 1 / rate if rate else None
+    for name, period_s in periods_s.items():
         if isinstance(period_s, (int, float, np.floating)) and period_s > 0:
             return round(period_s * 1e9), name
     return None
@@ -103,12 +103,12 @@ def _period(env: Any) -> tuple[int, str] | None:
 @cache
 def _period_ns(kind: Gym) -> int:
     """Return the period that the environment of a kind names; raises S2AError."""
-    with closing(kind.made()) as env:
-        found = _period(env)
-    if found is None:
+    with closing(kind.make_env()) as env:
+        period = _period(env)
+    if period is None:
         names = "no period (dt, tau, render_fps)"
         raise UsageError(f"`control_hz`: {kind.env} names {names}; say how often it takes actions")
-    return found[0]
+    return period[0]
 
 
 class GymRobot(TaskRobot):
@@ -116,7 +116,7 @@ class GymRobot(TaskRobot):
 
     def __init__(self, kind: Gym, period_ns: int) -> None:
         self._kind, self._period_s = kind, period_ns / 1e9
-        self._env = kind.made()
+        self._env = kind.make_env()
         space = self._env.action_space
         self._discrete = not hasattr(space, "high")
         bounds = (space.start, space.start + space.n - 1) if self._discrete else (space.low, space.high)
@@ -155,9 +155,9 @@ class GymRobot(TaskRobot):
         space = self._env.action_space
         whole = np.issubdtype(space.dtype, np.integer)
         taken = np.clip(np.rint(self._action) if whole else self._action, self._low, self._high)
-        given = int(taken[0]) if self._discrete else taken.reshape(space.shape).astype(space.dtype)
+        env_action = int(taken[0]) if self._discrete else taken.reshape(space.shape).astype(space.dtype)
         with self._kind.called("raised"):
-            self._seen, reward, self._terminated, self._truncated, info = self._env.step(given)
+            self._seen, reward, self._terminated, self._truncated, info = self._env.step(env_action)
         self._reward += float(reward)
         if (done := _done(info)) is not None:
             self._done = bool(self._done) or done
@@ -219,12 +219,12 @@ class GymRobot(TaskRobot):
         self._env.close()
 
     def _at(self, key: str) -> Any:
-        """Return what the observation has at a key, PARENT.CHILD within another, or all of it."""
+        """Return the observation's value at a key, PARENT.CHILD within another, or all of it."""
         seen = self._seen
         for name in key.split(".") if key else ():
             if not isinstance(seen, dict) or name not in seen:
-                known = f"; it has {', '.join(seen)}" if isinstance(seen, dict) else ""
-                raise RobotError(f"`robot`: gym: the observation of {self._kind.env} has no '{key}'{known}")
+                keys = f"; it has {', '.join(seen)}" if isinstance(seen, dict) else ""
+                raise RobotError(f"`robot`: gym: the observation of {self._kind.env} has no '{key}'{keys}")
             seen = seen[name]
         return seen
 

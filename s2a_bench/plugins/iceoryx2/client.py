@@ -68,6 +68,7 @@ class Iceoryx2Client(Client):
         server = domain.event(self._name).open()
         wake = server.notifier_builder().create()
         builder = domain.requests(self._name).open().client_builder().initial_max_slice_len(MIB)
+        # A request that finds the server's queue full is discarded instead of waiting, which `_answer` notices.
         builder = builder.backpressure_strategy(iceoryx2.BackpressureStrategy.DiscardData)
         port = builder.allocation_strategy(iceoryx2.AllocationStrategy.PowerOfTwo).create()
         for _ in range(secrets.randbelow(USED)):
@@ -181,7 +182,7 @@ class Iceoryx2Client(Client):
         except ERRORS as error:
             raise self._failed(error) from error
         except (ValueError, KeyError, TypeError, struct.error) as error:
-            raise RequestFailed(f"{self._name} sent what is no answer: {error!r}") from error
+            raise RequestFailed(f"{self._name} sent a malformed answer: {error!r}") from error
 
     def _read_slice(self, data: memoryview, stream: bytearray, bounds: Bounds) -> None:
         """Add a slice of this answer to its stream; raises MessagesLost for one that came too late."""

@@ -42,7 +42,7 @@ from s2a_bench.types import Piece, Request
 from s2a_bench.vectors import state_of
 
 ALIGNED: Final = iceoryx2.Alignment.new(8)
-"""What is counted in a slice is read and written whole."""
+"""Counters in a slice are read and written whole."""
 
 
 class Iceoryx2Server:
@@ -66,6 +66,7 @@ class Iceoryx2Server:
         """Return the source of requests, and the listener that they wake; raises an error of iceoryx2."""
         clients = min(CLIENTS, limits.connections)
         service = self._domain.requests(self.address).max_servers(1).max_clients(clients).max_nodes(clients + 1)
+        # Overflow that is "safe" loses silently: an unread answer is replaced by a newer one.
         service = service.enable_safe_overflow_for_requests(False).enable_safe_overflow_for_responses(False)
         service = service.max_active_requests_per_client(ACTIVE).max_loaned_requests(1)
         service = service.max_response_buffer_size(2 * UNREAD)
@@ -181,7 +182,7 @@ class Iceoryx2Exchange(Exchange):
             self._active = None  # iceoryx2 lends a client's requests by number, and a logged error would hold this one
 
     def _flush(self) -> bool:
-        """Send what the client has room for; return whether anything is left. Raises Disconnected."""
+        """Send as much as the client has room for; return whether anything is left. Raises Disconnected."""
         if self.disconnected():
             raise Disconnected
         unsent = self._unsent

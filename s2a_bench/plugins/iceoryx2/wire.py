@@ -1,4 +1,4 @@
-"""What both sides share: this user's domain of iceoryx2, its services and events, and how bytes lie in its slices.
+"""The wire format of both sides: this user's domain of iceoryx2, its services and events, the layout of its slices.
 
 A request is one slice: `HEAD`, a header in JSON, then the pictures. An answer is a stream of lines of JSON, a slice for
 each piece; the client counts in `HEAD` what it has read, and what it is too slow for goes into one of the next slices.
@@ -44,7 +44,7 @@ CLIENTS: Final = 64
 POLL_S: Final = 0.1
 """Longest wait for an event before the other side is checked."""
 PAUSE_S: Final = 0.002
-"""Between two looks, where nothing can wake: at a lock, or at whether a slow client has read, the engine being free."""
+"""Poll interval where no event wakes: of a lock, and of a slow client's reads while the engine is free."""
 LOCK_S: Final = 1.0
 """Longest wait for a process that joins or leaves."""
 PATH_BYTES: Final = 48
@@ -55,7 +55,7 @@ ERRORS: Final[tuple[type[Exception], ...]] = tuple(
 )
 """All exceptions of iceoryx2, which share no base; each says its kind in one word."""
 UNUSABLE: Final[tuple[type[Exception], ...]] = (*ERRORS, OSError, UnicodeError)
-"""What a folder raises that iceoryx2 cannot use."""
+"""Exceptions for a folder that iceoryx2 cannot use."""
 
 AnswerPart: TypeAlias = "Piece | Remote | str"
 """A piece, the server's marks at the end of an answer, or the error that ended it."""
@@ -94,7 +94,7 @@ class Domain:
         return self._node.service_builder(iceoryx2.ServiceName.new(whole)).event()
 
     def clean(self) -> None:
-        """Remove what killed processes left; their events then have no listener."""
+        """Remove the leftovers of killed processes; their events then have no listener."""
         self._node.try_cleanup_dead_nodes()
 
     def leave(self) -> None:
@@ -186,7 +186,7 @@ def packed(part: AnswerPart) -> bytes:
 
 
 def unpacked(stream: bytearray) -> Iterator[AnswerPart]:
-    """Take whole lines off a stream; raises RequestFailed, ValueError, KeyError or TypeError for what is none."""
+    """Take whole lines off a stream; raises RequestFailed, ValueError, KeyError or TypeError for malformed ones."""
     end = stream.rfind(b"\n") + 1
     lines = bytes(stream[:end]).splitlines()
     del stream[:end]

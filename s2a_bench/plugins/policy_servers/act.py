@@ -57,11 +57,11 @@ class OpenVla(Dialect):
         extras.require("json_numpy", "act")
         if not options.template:
             return
-        self._template = made = template_of(options.template)
-        made.check_server(self.name, ("path", "answer", "arrays_as_text", "arrays_as_lists"))
-        self.path = made.server.path or self.path
-        self.answer_kinds, self.accepts_state = (ACTIONS,), made.accepts_state
-        self.payloads = PolicyTransport.payloads[1:] if made.encoded else self.payloads
+        self._template = template = template_of(options.template)
+        template.check_server(self.name, ("path", "answer", "arrays_as_text", "arrays_as_lists"))
+        self.path = template.server.path or self.path
+        self.answer_kinds, self.accepts_state = (ACTIONS,), template.accepts_state
+        self.payloads = PolicyTransport.payloads[1:] if template.encoded else self.payloads
 
     def check(self, cameras: int, state: int) -> None:
         if self._template is not None:
@@ -113,7 +113,7 @@ class OpenVla(Dialect):
             return Event(finish="stop", facts={ACTION_N: count}, actions=actions)
         action = np.asarray(_arrays_in(message), np.float64)
         if not (action.size and np.isfinite(action).all()):
-            raise ValueError("an action that is no finite numbers")
+            raise ValueError("an action that is not a list of finite numbers")
         return Event(json.dumps(action.tolist()), finish="stop", facts={ACTION_N: float(action.size)})
 
 

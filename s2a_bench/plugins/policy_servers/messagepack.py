@@ -41,7 +41,8 @@ def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
         RecursionError,
         SyntaxError,
     ) as error:  # NumPy's of dtypes
-        raise RequestFailed(f"{len(data)} bytes that are no message: {str(error) or type(error).__name__}") from error
+        why = str(error) or type(error).__name__
+        raise RequestFailed(f"{len(data)} bytes that are not a message: {why}") from error
 
 
 def _no_extension(code: int, _: bytes) -> Any:
@@ -54,7 +55,7 @@ def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0) -> NDA
         raise RequestFailed(f"an array whose data is {type(data).__name__}, not bytes")
     axes: list[Any] = list(shape) if isinstance(shape, (list, tuple)) else [None]
     if not all(type(axis) is int and axis >= 0 for axis in axes):
-        raise RequestFailed(f"an array whose shape is none: {str(shape)[:80]}")
+        raise RequestFailed(f"an array whose shape is invalid: {str(shape)[:80]}")
     size = len(data) - start
     if prod(axes) * dtype.itemsize != size:
         raise RequestFailed(f"an array of shape {str(tuple(axes))[:80]} and type {dtype} in {size} bytes")

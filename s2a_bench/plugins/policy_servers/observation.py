@@ -3,7 +3,7 @@
 It holds the nested dictionary that the policy expects; docs/policy-servers.md lists the texts in it that are
 placeholders. Pictures are uint8 (H, W, 3) RGB, the state is float32 (D,). A list of arrays becomes one array with one
 more axis in front: ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of
-text. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer` reads it. The
+text. The table `EXTENSION` is not part of the observation: it describes the server, as `ExternalServer` reads it. The
 files in ``templates`` beside this module are known by name.
 """
 
@@ -34,7 +34,7 @@ ANY: Final = "*"
 CAMERAS: Final = 64
 """The most pictures of a template."""
 PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
-"""What may stand before the names of pictures that a server lists (SGLang)."""
+"""Prefixes of the names of pictures that a server lists (SGLang)."""
 
 _PLACE = re.compile(
     r"\{(?:(?P<all>images)|(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
@@ -60,7 +60,7 @@ _Make: TypeAlias = Callable[[_Values], Any]
 
 
 class ExternalServer(toml_file.TomlTable):
-    """How a policy server differs from openpi's, the table `EXTENSION` of a template."""
+    """The differences of a policy server from openpi's: the table `EXTENSION` of a template."""
 
     path: Annotated[str, Field(max_length=200, pattern=r"^(/[\w.~/-]*)?$")] = ""
     """Path of its address, where `url` has none."""
@@ -147,8 +147,8 @@ class Template:
     def _refuse(self, path: str, why: str) -> NoReturn:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")
 
-    def _missing(self, path: str, wanted: str, given: object) -> _Missing:
-        return _Missing(f"`template` {self.name}: {path} wants {wanted}, and the request has {given}")
+    def _missing(self, path: str, wanted: str, present: object) -> _Missing:
+        return _Missing(f"`template` {self.name}: {path} wants {wanted}, and the request has {present}")
 
     def _value(self, value: Any, path: str) -> _Make:
         if isinstance(value, Mapping):
@@ -162,17 +162,17 @@ class Template:
         return lambda _: value
 
     def _table(self, table: Mapping[str, Any], path: str) -> _Make:
-        made: dict[str, tuple[_Make, bool]] = {}
+        makers: dict[str, tuple[_Make, bool]] = {}
         for key, value in table.items():
             name = key.removesuffix("?")
             inner = f"{path}.{name}" if path else name
-            if not name or name in made:
+            if not name or name in makers:
                 self._refuse(inner, "is twice there, or empty")
-            made[name] = self._value(value, inner), name != key
+            makers[name] = self._value(value, inner), name != key
 
         def make(values: _Values) -> dict[str, Any]:
             filled: dict[str, Any] = {}
-            for name, (value, optional) in made.items():
+            for name, (value, optional) in makers.items():
                 try:
                     filled |= _keyed(name, value(values), values.names)
                 except _Missing:
@@ -208,9 +208,9 @@ class Template:
         for brace in _IN_TEXT.finditer(text):
             if brace[0] in {"{", "}"}:
                 places = "{image}, {image:1}, {image:0|CHW}, {images}, {state}, {state:0:7}, {prompt}, {session}"
-                self._refuse(path, f"has a brace that is no place: {text!r}; there are {places}, and {{{{ for a brace")
-        known = {**_BRACES, "{session}": self._session}
-        return lambda values: _IN_TEXT.sub(lambda brace: known.get(brace[0], values.prompt), text)
+                self._refuse(path, f"has an unknown place: {text!r}; there are {places}, and {{{{ for a brace")
+        texts = {**_BRACES, "{session}": self._session}
+        return lambda values: _IN_TEXT.sub(lambda brace: texts.get(brace[0], values.prompt), text)
 
     def _pictures(self, path: str) -> _Make:
         self.pictures = CAMERAS
@@ -246,7 +246,7 @@ class Template:
     def _state(self, path: str, start: str, stop: str) -> _Make:
         first, last = int(start or 0), int(stop) if stop else None
         if last is not None and last <= first:
-            self._refuse(path, f"wants the numbers {first}:{last} of the state, which are none")
+            self._refuse(path, f"wants the numbers {first}:{last} of the state: an empty range")
         self.accepts_state = True
 
         def make(values: _Values) -> Vector:
@@ -264,10 +264,10 @@ def names() -> list[str]:
 
 def template_of(name: str) -> Template:
     """Return the template of a name, or of a TOML or JSON file; raises UsageError."""
-    known = names()
-    path = TEMPLATES / f"{name}.toml" if name in known else Path(name)
+    built_in = names()
+    path = TEMPLATES / f"{name}.toml" if name in built_in else Path(name)
     if not path.suffix:
-        raise UsageError(f"`template`: {none_of(name, known, ', nor a TOML or JSON file')}")
+        raise UsageError(f"`template`: {none_of(name, built_in, ', nor a TOML or JSON file')}")
     text = toml_file.read(path, "template")
     try:
         return Template(_loads(text, name) if path.suffix == ".json" else toml_file.loads(text, name), name)
@@ -279,7 +279,7 @@ def _loads(text: str, name: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_table)
     except ValueError as error:
-        raise UsageError(f"`template` {name}: no JSON: {error}") from error
+        raise UsageError(f"`template` {name}: not JSON: {error}") from error
 
 
 def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -299,8 +299,8 @@ def _keyed(name: str, value: Any, names: Sequence[str]) -> dict[str, Any]:
     if not (names and name.endswith(ANY)):
         return {name: value}
     if len(value) > len(names):
-        known = f"{len(names)} pictures ({', '.join(names)})"
-        raise RequestFailed(f"the server reads {known}, not {len(value)}; see `cameras`")
+        wanted = f"{len(names)} pictures ({', '.join(names)})"
+        raise RequestFailed(f"the server reads {wanted}, not {len(value)}; see `cameras`")
     return {name.removesuffix(ANY) + key: picture for key, picture in zip(names, value, strict=False)}
 
 

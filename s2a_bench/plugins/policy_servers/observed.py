@@ -155,4 +155,4 @@ def remote_of(message: Any) -> Remote:
     try:
         return Remote.of_json(message[EXTENSION])
     except (LookupError, TypeError, ValueError) as error:
-        raise RequestFailed(f"what should be the server's marks is none: {error!r}") from error
+        raise RequestFailed(f"the server's marks are malformed: {error!r}") from error

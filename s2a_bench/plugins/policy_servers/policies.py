@@ -1,4 +1,4 @@
-"""What transports of policy servers share: an observation from a template goes up, a chunk of actions comes back."""
+"""The base of transports to policy servers: a template's observation goes up, a chunk of actions comes back."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def policy_picture(frame: Frame, payload: str, trace: Trace) -> Pixels:
 
 
 class PolicyClient(Client, Generic[P]):
-    _link: Any = None
+    _connection: Any = None
     """The connection, where there is one."""
 
     def __init__(self, wiring: Wiring[P], alive: Callable[[], bool]) -> None:
@@ -58,9 +58,9 @@ class PolicyClient(Client, Generic[P]):
 
     def _abandon(self) -> None:
         """Give up the connection, whose answer is incomplete."""
-        if self._link is not None:
-            self._link.close()
-            self._link = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
 
     def close(self) -> None:
         self._abandon()

@@ -155,7 +155,7 @@ class RclpyActionClient:
         self._canceller.call_async(request)
 
     def tell(self, feedback: list[Any]) -> None:
-        """Turn what has arrived into events; on the consuming thread, under the lock."""
+        """Turn the messages that have arrived into events; on the consuming thread, under the lock."""
         events: list[ActionEvent] = []
         for goal_id, handle in _settled(self._sent):
             if handle.accepted:

@@ -1,10 +1,10 @@
-"""What all of rclpy's endpoints here share: a node that a thread spins, and waiting for one entity without it.
+"""A node of rclpy that a thread spins, and waiting for one of its entities without that thread.
 
 The thread serves services and the answers to cancels. One SingleThreadedExecutor a node: no callback here ever blocks.
 Topics and actions have consumers that wait for themselves, as `rclpy.wait_for_message` does, because an executor makes
 its lists anew for each event and hands what came to another thread, which costs more than the message itself. Their
 entity is in a callback group that never executes, so that executors pass it by, and its consumer waits in a wait set of
-its own. Wait sets are no public part of rclpy; Humble's and Jazzy's are the same.
+its own. Wait sets are not a public part of rclpy; Humble's and Jazzy's are the same.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class SpinningNode:
         while not self._closing.is_set():
             try:
                 self._executor.spin_once()
-            except ExternalShutdownException:
+            except ExternalShutdownException:  # rclpy was shut down elsewhere in this process
                 return
             except Exception:  # noqa: BLE001 - whatever a callback raised ends in spin_once
                 _log.exception("a callback of rclpy failed")
@@ -118,7 +118,7 @@ class Unserved(CallbackGroup):  # type: ignore[misc]
     beginning_execution = can_execute
 
     def ending_execution(self, entity: Any) -> None:
-        """Nothing has begun."""
+        """Do nothing: no callback has begun."""
 
 
 class RclpyWaiter:

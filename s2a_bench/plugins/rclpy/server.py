@@ -29,9 +29,9 @@ from s2a_bench.ros.llama import images_of
 from s2a_bench.ros.service import WAIT_SLICE_NS
 
 PAUSE_S = 0.1
-"""After a failure: a wait that fails does so at once."""
+"""Pause after a failed wait, which would fail again at once."""
 ENDS = {Status.SUCCEEDED: "succeed", Status.ABORTED: "abort", Status.CANCELED: "canceled"}
-"""How a goal ends -> the method of rclpy's goal handle."""
+"""Final status of a goal -> the method of rclpy's goal handle."""
 
 _log = logging.getLogger(__name__)
 
@@ -191,7 +191,7 @@ class RclpyActionServer:
         self._server.destroy()
 
     def _serve(self) -> None:
-        """Take what comes until closed; a request that fails is reported and the next is served."""
+        """Take requests until closed; one that fails is reported and the next is served."""
         while not self._waiter.interrupted:
             try:
                 if self._waiter.wait_until(now_ns() + WAIT_SLICE_NS):

@@ -36,21 +36,21 @@ def interface_class(type_name: str) -> Any:
 
 def to_ros(message: Any, cls: Any, type_name: str, version: str) -> Any:
     with _without_pixels(message, np.empty(0, np.uint8)) as pixels:
-        made = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
-    for image, its in zip(images_of(made), pixels, strict=True):
+        converted = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
+    for image, its in zip(images_of(converted), pixels, strict=True):
         data = array("B")
         data.frombytes(np.ascontiguousarray(its).data.cast("B"))
         image.data = data
-    return made
+    return converted
 
 
 def from_ros(message: Any, type_name: str, version: str) -> Any:
     """Turn a message of a generated class into a rosbags message, whose arrays are views of its CDR or pixels."""
     with _without_pixels(message, array("B")) as pixels:
-        made = ros.deserialise(memoryview(serialize_message(message)), type_name, version)
-    for image, its in zip(images_of(made), pixels, strict=True):
+        converted = ros.deserialise(memoryview(serialize_message(message)), type_name, version)
+    for image, its in zip(images_of(converted), pixels, strict=True):
         image.data = np.frombuffer(its, np.uint8)
-    return made
+    return converted
 
 
 @contextmanager
@@ -100,11 +100,11 @@ def message_class(type_name: str) -> Any:
 
 
 def installed_version(action: Any, type_name: str) -> str:
-    """Return the version of llama_msgs that the workspace has; raises MissingInterface where it is none we know."""
+    """Return the version of llama_msgs that the workspace has; raises MissingInterface for an unknown one."""
     for version in ros.VERSIONS:
         if fits(action.Goal, type_name + "_Goal", version):
             return version
-    raise MissingInterface(f"{type_name} of this ROS 2 workspace is none of llama_msgs {', '.join(ros.VERSIONS)}")
+    raise MissingInterface(f"{type_name} of this ROS 2 workspace is not one of llama_msgs {', '.join(ros.VERSIONS)}")
 
 
 def has_action(type_name: str) -> bool:

@@ -47,11 +47,11 @@ FIRST_PAUSE_NS: Final = 50_000_000
 """Time between these: a second together, which bounds the clocks' rate."""
 BURST: Final = 5
 FLOAT_NS: Final = 1000
-"""What a wall clock loses as a float of ms."""
+"""The rounding of a wall clock as a float of ms."""
 WANDER: Final = 1e-5
 """Rate at which a disciplined wall clock may leave its bound while a reading is fresh."""
 PERIOD_NS: Final = 10**9
-"""Between requests, one burst of exchanges in this time at most."""
+"""The shortest time between two bursts of exchanges, between requests."""
 PATIENCE_S: Final = 3.0
 """Most time in which a program tells the wall clock's error."""
 FRESH_NS: Final = 10**9
@@ -232,19 +232,19 @@ class RemoteClock:
 
 
 @dataclass(slots=True)
-class Asked:
+class ClockProgram:
     """A program that knows the error of the wall clock."""
 
     system: str
     command: tuple[str, ...]
     error_s: Callable[[str], float]
     """Reads the error off its output."""
-    known: WallClock | None = None
+    last: WallClock | None = None
 
     def __call__(self) -> WallClock:
         """Read the wall clock, and ask for its error; raises RequestFailed if that is not told."""
-        if self.known and now_ns() - self.known.read_ns < FRESH_NS:
-            return self.known
+        if self.last and now_ns() - self.last.read_ns < FRESH_NS:
+            return self.last
         try:
             done = subprocess.run(  # noqa: S603 - one of two fixed commands
                 self.command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
@@ -256,8 +256,8 @@ class Asked:
             ) from error
         began_ns, offset_ns = now_ns(), realtime_offset_ns()
         ended_ns = now_ns()
-        self.known = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
-        return self.known
+        self.last = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
+        return self.last
 
 
 def chrony_error_s(csv: str) -> float:
@@ -275,5 +275,5 @@ def ptp_error_s(text: str) -> float:
     return (abs(offset_ns) + delay_ns) / 1e9
 
 
-CHRONY: Final = Asked("chrony", ("chronyc", "-c", "tracking"), chrony_error_s)
-PTP: Final = Asked("ptp", ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"), ptp_error_s)
+CHRONY: Final = ClockProgram("chrony", ("chronyc", "-c", "tracking"), chrony_error_s)
+PTP: Final = ClockProgram("ptp", ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"), ptp_error_s)

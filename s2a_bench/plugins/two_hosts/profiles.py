@@ -28,9 +28,9 @@ OPPORTUNITY_BYTES: Final = 1500
 """Bytes of a delivery opportunity in mahimahi's traces."""
 MOST_STEPS: Final = 1_000_000
 STEP_S, MEMORY_S, SYNTHETIC_S = 0.1, 1.0, 600.0
-"""Of a synthetic rate: its step, the time in which it forgets, and its period."""
+"""The step of a synthetic rate, its correlation time, and its period."""
 OFF, DELAY_OFF_MS = 0.05, 0.3
-"""By how much an emulated link may be off its profile: a share of its rate and delay, and in ms of each delay."""
+"""The tolerance of an emulated link: a share of its profile's rate and delay, and ms of each delay."""
 KEYS: Final = {"delay": "delay_ms", "jitter": "jitter_ms", "up": "up_mbps", "down": "down_mbps"}
 
 Rate = Annotated[float, Field(gt=0, le=1e6)]
@@ -54,7 +54,7 @@ class Direction:
 
     mbps: float
     delay_ms: float = 0.0
-    """With ``steps`` the least of them, without jitter."""
+    """The delay without jitter; with ``steps`` the least of them."""
     jitter_ms: float = 0.0
     loss: float = 0.0
     burst_bytes: float = 0.0
@@ -95,7 +95,7 @@ class LinkProfile(TomlTable):
     burst_kib: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     burst_mbps: Rate | None = None
     queue_ms: Annotated[float, Field(gt=0, le=60_000)] = 1000.0
-    """What waits longer than this for the rate is lost, as in a router's full buffer."""
+    """The longest wait for the rate; a packet beyond it is lost, as in a router's full buffer."""
     rate_cv: Annotated[float, Field(ge=0, le=2)] = 0.0
     outage_every_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Mean time between synthetic outages; 0: none."""
@@ -170,10 +170,10 @@ def load_link(text: str) -> LinkProfile:
         values = {"trace": first}
     elif "/" in first or first.endswith(".toml"):
         values = {"name": Path(first).stem, **loads(read(first, "link"), f"link {first}")}
-    elif first in (known := published()):
-        values = known[first].model_dump(exclude_unset=True)
+    elif first in (profiles := published()):
+        values = profiles[first].model_dump(exclude_unset=True)
     else:
-        raise UsageError(f"`link`: {none_of(first, known, ', and no file (.toml, .csv) and no KEY=VALUE')}")
+        raise UsageError(f"`link`: {none_of(first, profiles, ', and no file (.toml, .csv) and no KEY=VALUE')}")
     for pair in pairs:
         values |= _pair(pair)
     named = {"name": text} | values

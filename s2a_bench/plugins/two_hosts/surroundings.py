@@ -36,7 +36,7 @@ class HostOptions(Options):
 class TwoHosts(Surroundings):
     profile: LinkProfile | None = None
     system: str = ""
-    """What bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or nothing."""
+    """The service that bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or ""."""
 
     options: ClassVar[type[Options]] = HostOptions
     columns: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:bounded"

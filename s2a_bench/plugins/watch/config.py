@@ -16,7 +16,7 @@ from s2a_bench.transport.listening import check_url, is_loopback
 from s2a_bench.transport.risks import is_local
 
 PORTS: Final = {"http": 80, "ws": 80, "https": 443, "wss": 443}
-"""Those of URLs without one."""
+"""The ports of URLs without one."""
 
 
 def schemes() -> list[str]:
@@ -99,6 +99,6 @@ class WatchTopics(WatchOptions):
 
 
 class WatchBag(WatchTopics):
-    """The same topics in a recording."""
+    """The same topics, read from a recording."""
 
     bag: Path = option(..., "rosbag2 folder, .mcap or .db3 file: read it by its log times", first=True)

@@ -33,7 +33,7 @@ class LastMinute:
     rows: deque[ExchangeRow] = field(default_factory=lambda: deque(maxlen=MOST))
     sends: dict[str, str] = field(default_factory=dict)
     """Kind of exchange -> what its requests hold."""
-    _drawn: RenderableType = "nothing has passed in the last minute"
+    _last: RenderableType = "nothing has passed in the last minute"
     _drawn_ns: int = 0
 
     def draw(self, width: int) -> RenderableType:
@@ -43,8 +43,8 @@ class LastMinute:
             if rows:
                 cells = Cells(pd.DataFrame(rows), ExchangeRow, Origins(Provenance())).split()
                 sends = (Text(one_line(f"{cell} sends {each}")) for cell, each in list(self.sends.items()))
-                self._drawn = Group(lay_out(cycle_table(cells), width), *sends)
-        return self._drawn
+                self._last = Group(lay_out(cycle_table(cells), width), *sends)
+        return self._last
 
     def lines(self) -> Iterator[str]:
         return iter(())  # the run's own table follows

@@ -1,4 +1,4 @@
-"""Which answer on one topic belongs to which observation on another; no I/O."""
+"""Pairs the answers on one topic with the observations on another; no I/O."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class TopicMessage(NamedTuple):
     at_ns: int
     size: int
     stamp_ns: int | None = None
-    """Of its header; None for a type without one, and for one that was not set."""
+    """The stamp of its header; None for a type without one, and for a stamp that was not set."""
 
 
 class Pairs:
@@ -52,7 +52,7 @@ class Pairs:
             self._hold(message)
 
     def end(self) -> None:
-        """Tell of the last exchange."""
+        """Report the last exchange."""
         self._decide(self.paired or ORDER)
         self._close()
 
@@ -94,6 +94,6 @@ class Pairs:
     def _close(self) -> None:
         if seen := self._open:
             self._open = None
-            if seen.pieces_ns == [seen.answer_ns]:
+            if seen.pieces_ns == [seen.answer_ns]:  # an answer in one message is not a stream
                 seen.pieces_ns.clear()
             self._report(seen)

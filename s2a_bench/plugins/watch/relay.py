@@ -29,7 +29,7 @@ class TappedClient:
     number: int
     host: str
     wire: Wire | None = None
-    """Its connection; None between two."""
+    """The present connection; None between two."""
 
 
 @dataclass(slots=True)
@@ -63,7 +63,7 @@ class ByteRelay:
         self._lock = Lock()
         self._clients: list[TappedClient] = []
         self._joined: dict[socket.socket, Thread] = {}
-        self._known: set[str] = set()
+        self._kinds: set[str] = set()
         self._lines: set[str] = set()
         self._connections = Connections(self.listener, self._handle, LIMITS.connections, b"")
 
@@ -82,7 +82,7 @@ class ByteRelay:
         client, server = self._client_of(wire), None
         try:
             server = socket.create_connection(self.server, CONNECT_S)
-            server.settimeout(None)
+            server.settimeout(None)  # that of the connect would end silent connections
             self._joined[server] = current_thread()
             self._join(client, wire.socket, server)
         except OSError as error:
@@ -95,7 +95,7 @@ class ByteRelay:
                 server.close()
 
     def _client_of(self, wire: Wire) -> TappedClient:
-        """Return who connects: a client of that host whose connection has ended, else a new one."""
+        """Return the client that connects: one of that host whose connection has ended, else a new one."""
         host = wire.socket.getpeername()[0]
         with self._lock:
             self.totals.connections += 1
@@ -111,8 +111,8 @@ class ByteRelay:
 
     def _join(self, client: TappedClient, robot: socket.socket, server: socket.socket) -> None:
         for each in (robot, server):
-            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        passed = Passed(self.reader(lambda seen: self.report(client.number, seen), self._known), self._failed)
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # the relay itself must hold nothing back
+        passed = Passed(self.reader(lambda seen: self.report(client.number, seen), self._kinds), self._failed)
         down = Thread(target=_pass, args=(server, robot, passed), kwargs={"up": False}, name="down", daemon=True)
         down.start()
         _pass(robot, server, passed, up=True)
@@ -157,7 +157,7 @@ class Passed:
         return part
 
     def read(self) -> None:
-        """Read what has been passed on, up to a part that has not been yet, which may be the request before it."""
+        """Read the parts that have been passed on, up to one that has not been yet, perhaps the request before them."""
         with self._lock:
             while self._parts and (self._parts[0].to_ns or len(self._parts) > MOST_HELD):
                 self._read(self._parts.popleft())
@@ -190,7 +190,7 @@ def _pass(source: socket.socket, target: socket.socket, passed: Passed, *, up: b
             passed.read()
     except OSError:
         how = socket.SHUT_RDWR
-        with suppress(OSError):
+        with suppress(OSError):  # it may be closed already
             source.shutdown(how)
     with suppress(OSError):
         target.shutdown(how)

@@ -71,7 +71,7 @@ COMPARED: Final = Comparable.of(EXCHANGES, ("period_s", "upload_s", "server_s", 
 
 @dataclass(slots=True)
 class Before:
-    """What is known of a client's exchanges of one kind so far."""
+    """The state of a client's exchanges of one kind so far."""
 
     request_ns: int = 0
     end_ns: int = 0
@@ -81,10 +81,10 @@ class Before:
 
 @dataclass(slots=True)
 class SeenCycles:
-    """Turns what was seen into rows, client by client."""
+    """Turns exchanges into rows, client by client."""
 
     tick_ns: float = 0.0
-    """Of the robot's control loop; 0: not known."""
+    """The tick of the robot's control loop; 0: unknown."""
     _before: dict[tuple[int, str], Before] = field(default_factory=dict)
 
     def row(self, client: int, seen: Seen) -> ExchangeRow:

@@ -78,7 +78,7 @@ class Watch:
                     self._keep(*self._reported.get(timeout=POLL_S))
 
     def keep_rest(self) -> int:
-        """Write what was reported since, and return how many exchanges there were."""
+        """Write the exchanges reported since, and return how many there were in all."""
         while not (self._reported.empty() or self._full):
             self._keep(*self._reported.get())
         return self._kept
@@ -91,7 +91,7 @@ class Watch:
         self.writer.tokens(tokens_of(row, seen, number))
         self.view.rows.append(row)
         if seen.observation is not None:
-            with suppress(RecursionError):
+            with suppress(RecursionError):  # it may be nested too deep to be described
                 self.view.sends[row.cell] = described(seen.observation)
                 self.writer.update(sends=dict(self.view.sends))
 

@@ -1,4 +1,4 @@
-"""What a robot sends, in words: the pictures, numbers and texts of a decoded request."""
+"""Describes a decoded request in words: its pictures, numbers and texts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from s2a_bench.transport.pictures import JPEG_QUALITY
 LEAST_SIDE: Final = 16
 """Pixels of an array that counts as a picture."""
 LEAST_LETTERS: Final = 256
-"""Of a text that may be a picture in Base64."""
+"""The least letters of a text that may be a picture in Base64."""
 MOST: Final = 10_000
 """Values of a request that are looked at."""
 FILES: Final = {b"\xff\xd8\xff": "JPEG", b"\x89PNG": "PNG"}
@@ -28,11 +28,11 @@ NUMBER, TEXT, BYTE = "number", "text", "byte"
 
 def described(request: Any) -> str:
     """Describe a request: "3 pictures 224x224 float32, 8 numbers, 1 text; as JPEG about 60 kB"."""
-    found, jpeg = Counter[str](), 0
+    counts, jpeg = Counter[str](), 0
     for kind, count, size in islice(_values(request), MOST):
-        found[kind] += count
+        counts[kind] += count
         jpeg += size
-    words = ", ".join(f"{count} {_plural(kind) if count > 1 else kind}" for kind, count in found.items())
+    words = ", ".join(f"{count} {_plural(kind) if count > 1 else kind}" for kind, count in counts.items())
     return words + (f"; as JPEG about {max(1, round(jpeg / 1e3))} kB" if jpeg else "")
 
 
@@ -42,7 +42,7 @@ def _plural(kind: str) -> str:
 
 
 def _values(value: Any) -> Iterator[tuple[str, int, int]]:
-    """Yield kind, count, and bytes as JPEG of what is no JPEG yet."""
+    """Yield kind, count, and the bytes as JPEG of pictures in other codings."""
     if isinstance(value, dict):
         for each in value.values():
             yield from _values(each)
@@ -60,7 +60,7 @@ def _values(value: Any) -> Iterator[tuple[str, int, int]]:
 
 
 def _array(array: NDArray[Any]) -> tuple[str, int, int]:
-    """Tell pictures, (..., H, W, 3) or (..., 3, H, W), from numbers."""
+    """Distinguish pictures, (..., H, W, 3) or (..., 3, H, W), from numbers."""
     if array.ndim >= 3 and array.shape[-3] == 3 != array.shape[-1]:  # noqa: PLR2004 - colours first
         array = np.moveaxis(array, -3, -1)
     if array.ndim < 3 or array.shape[-1] != 3 or min(array.shape[-3:-1]) < LEAST_SIDE:  # noqa: PLR2004

@@ -61,10 +61,10 @@ def stamp_of(cdr: Any) -> int | None:
 
 def is_stamped(type_name: str, recorded: MessageDefinition | None = None) -> bool:
     """Return whether a type's first field is a header; of one we do not know, a recording has the definition."""
-    known = ros.typestore().fielddefs
-    if type_name not in known and recorded and recorded.format == MessageDefinitionFormat.MSG:
-        known = get_types_from_msg(recorded.data, type_name)
-    return bool(known.get(type_name, ((), []))[1][:1] == [HEADER])
+    definitions = ros.typestore().fielddefs
+    if type_name not in definitions and recorded and recorded.format == MessageDefinitionFormat.MSG:
+        definitions = get_types_from_msg(recorded.data, type_name)
+    return bool(definitions.get(type_name, ((), []))[1][:1] == [HEADER])
 
 
 def run_topics(config: WatchTopics, output: Path, progress: Progress) -> Path:
@@ -75,19 +75,19 @@ def run_topics(config: WatchTopics, output: Path, progress: Progress) -> Path:
     names = topic_names(config.in_.partition("?")[0], config.out)
     how = build(RosParameters, config.in_, "in_")
     with closing(how.join("/s2a_bench/watch", lambda node: node)) as node:
-        found: list[tuple[Topic, Subscription]] = []
+        subscribed: list[tuple[Topic, Subscription]] = []
         for name in names:  # no comprehension: Zenoh cannot drop its items while an error passes
-            found.append(_subscribed(node, name, how.wait_s, answer=name == names[1]))  # noqa: PERF401
+            subscribed.append(_subscribed(node, name, how.wait_s, answer=name == names[1]))  # noqa: PERF401
         with opened(config, output, progress, "ros", Provenance(tokens=AT_TOPICS)) as watch:
-            pairs = _pairs(watch, names, [topic for topic, _ in found])
-            with _received(found, pairs, progress):
+            pairs = _pairs(watch, names, [topic for topic, _ in subscribed])
+            with _received(subscribed, pairs, progress):
                 watch.keep_until_done()
             watch.writer.update(middleware=node.describe())
             return _finish(watch, pairs, names)
 
 
 @contextmanager
-def _received(found: list[tuple[Topic, Subscription]], pairs: Pairs, progress: Progress) -> Iterator[None]:
+def _received(subscribed: list[tuple[Topic, Subscription]], pairs: Pairs, progress: Progress) -> Iterator[None]:
     """Feed the pairs within the context, by a thread for each topic, in order of time."""
     lock, ended = Lock(), Event()
 
@@ -100,14 +100,14 @@ def _received(found: list[tuple[Topic, Subscription]], pairs: Pairs, progress: P
         except TransportError as error:
             progress.say(str(error))
 
-    threads = [Thread(target=receive, args=each, name="topic", daemon=True) for each in found]
+    threads = [Thread(target=receive, args=each, name="topic", daemon=True) for each in subscribed]
     for thread in threads:
         thread.start()
     try:
         yield
     finally:
         ended.set()
-        for (_, subscription), thread in zip(found, threads, strict=True):
+        for (_, subscription), thread in zip(subscribed, threads, strict=True):
             subscription.interrupt()
             thread.join()
 
@@ -136,7 +136,7 @@ def run_bag(config: WatchBag, output: Path, progress: Progress) -> Path:
     """Read both topics of a recording and return the run folder; raises S2AError, also if no exchange was seen.
 
     Times are those of the recording's log, on the clock of the system that recorded it: that may have been set
-    meanwhile, and is no CLOCK_MONOTONIC. `seconds` are counted from the recording's beginning.
+    meanwhile, and is not CLOCK_MONOTONIC. `seconds` are counted from the recording's beginning.
     """
     names, path = topic_names(config.in_, config.out), str(config.bag)
     reader = open_recording(path, "bag")
@@ -184,7 +184,7 @@ def _messages(reader: Any, path: str, ids: Container[int], seconds: float) -> It
 
 
 def topic_names(observations: str, answers: str) -> tuple[str, str]:
-    """Return both; raises UsageError for what is no topic, or twice the same."""
+    """Return both; raises UsageError for an invalid topic, or twice the same."""
     for field, name in (("in_", observations), ("out", answers)):
         if not ABSOLUTE.fullmatch(name):
             raise UsageError(f"`{field}`: '{name}' should look like /camera/image_raw, from the root")
@@ -204,7 +204,7 @@ def _pairs(watch: Watch, names: tuple[str, str], topics: Iterable[Topic]) -> Pai
 
 
 def _finish(watch: Watch, pairs: Pairs, names: tuple[str, str]) -> Path:
-    """Write what is left and return the run folder; raises TransportError if no exchange was seen."""
+    """Write the last exchanges and return the run folder; raises TransportError if none was seen."""
     pairs.end()
     exchanges = watch.keep_rest()
     counts = {name: getattr(pairs, name) for name in ("paired", "observations", "answers", "unpaired")}

@@ -15,7 +15,7 @@ from s2a_bench.transport.listening import is_loopback
 
 EXTRA = "ROS 2 over Zenoh, as rmw_zenoh speaks it"
 ROUTER: Final = "tcp/127.0.0.1:7447"
-"""Where rmw_zenoh's nodes look for their router."""
+"""The address at which rmw_zenoh's nodes look for their router."""
 ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
 LOOK_S: Final = 1.0
 STATE_AT: Final = 3

@@ -26,7 +26,7 @@ from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, ser
 from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, ServiceSpec, awaited
 
 CACHED_AT_MOST: Final = 1000
-"""What a latched topic that keeps all keeps."""
+"""The depth of a latched topic with KEEP_ALL."""
 ANSWER_S: Final = 86_400.0
 """A query may wait so long for its reply, as that for a goal's result does; callers wait less."""
 
@@ -84,7 +84,7 @@ class ZenohSubscription:
         self._seen = node.announce(names.SUBSCRIPTION, topic, type_name, version, qos)
 
     def _declared(self, key: str, qos: QoS) -> Any:
-        """Declare what fills the inbox; of a latched topic also with what its publishers keep."""
+        """Declare the subscriber that fills the inbox; of a latched topic also with the samples its publishers keep."""
         held = ref(self._inbox)  # Zenoh keeps the callback for as long as the session lives
 
         def put(sample: Any) -> None:
@@ -109,7 +109,7 @@ class ZenohSubscription:
         return None
 
     def _wanted(self, sample: Any) -> bool:
-        """Return True for a ROS message within its lifespan; log the first that is no ROS message."""
+        """Return True for a ROS message within its lifespan; log the first that is not a ROS message."""
         try:
             _, source_ns, self._sender = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
         except TransportError as error:
@@ -163,11 +163,12 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
                 query.drop()
 
         with refusals(spec.name):
+            # Complete, as rmw_zenoh's clients send requests to complete queryables only.
             self._queryable = node.session.declare_queryable(self._key, direct(put), complete=True)
         self._seen = node.announce(names.SERVICE, spec.name, spec.type_name, spec.version, qos)
 
     def arrived(self) -> Iterator[tuple[memoryview, QueryOrigin]]:
-        """Take what has arrived, a bounded number; drop queries that are not rmw_zenoh's and log the first."""
+        """Take the queries that have arrived, a bounded number; drop those not of rmw_zenoh and log the first."""
         for query in self._inbox.arrived():
             payload, attachment = query.payload, query.attachment
             try:

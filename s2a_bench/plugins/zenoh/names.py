@@ -1,4 +1,4 @@
-"""How rmw_zenoh names things: key expressions, liveliness tokens, and the attachment of each message. No I/O.
+"""The names of rmw_zenoh: key expressions, liveliness tokens, and the attachment of each message. No I/O.
 
 After rmw_zenoh_cpp (``docs/design.md``, ``liveliness_utils.cpp``, ``attachment_helpers.cpp``) as Jazzy has it from
 0.2.4 on, with 33 bytes of attachment; Humble's is the same without type hashes.
@@ -24,7 +24,7 @@ NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
 NO_HASH: Final = "TypeHashNotSupported"
 """Humble's."""
 PARTS: Final = 13
-"""Of the token of an entity that is no node."""
+"""The parts of the token of an endpoint."""
 ATTACHMENT: Final = struct.Struct("<qqB16s")
 """Sequence number, source time in ns of ROS time, 16, and the sender's gid."""
 BEST_EFFORT, TRANSIENT_LOCAL, KEEP_ALL = "2", "1", "2"
@@ -33,13 +33,13 @@ BEST_EFFORT, TRANSIENT_LOCAL, KEEP_ALL = "2", "1", "2"
 
 @dataclass(frozen=True, slots=True)
 class Entity:
-    """What a liveliness token tells of an endpoint."""
+    """An endpoint, as its liveliness token describes it."""
 
     kind: str
     name: str
-    """With % for /; the root namespace is one %."""
+    """The name with % for /; the root namespace is one %."""
     type_name: str
-    """As ``sensor_msgs::msg::dds_::Image_``."""
+    """The type on the wire, such as ``sensor_msgs::msg::dds_::Image_``."""
     type_hash: str
 
 
@@ -78,7 +78,7 @@ def _token(domain_id: int, session: str, number: int, kind: str, node_name: str)
 
 
 def entity_of(token: str) -> Entity | None:
-    """Read the token of an endpoint; None for a node's, and for what is none."""
+    """Read the token of an endpoint; None for a node's, and for anything else."""
     parts = token.split("/")
     if len(parts) != PARTS or parts[0] != ADMIN:
         return None
@@ -102,7 +102,7 @@ def attachment(sequence: int, gid: bytes) -> bytes:
 
 
 def attached(data: bytes) -> tuple[int, int, bytes]:
-    """Read an attachment: (sequence number, source time, gid); raises TransportError for what is none."""
+    """Read an attachment: (sequence number, source time, gid); raises TransportError for a malformed one."""
     if len(data) == ATTACHMENT.size:
         sequence, source_ns, size, gid = ATTACHMENT.unpack(data)
         if size == len(gid):

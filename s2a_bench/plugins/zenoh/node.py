@@ -34,15 +34,15 @@ MESSAGE_BYTES: Final = 128 << 20
 RECEIVE_BYTES: Final = 1 << 20
 """Read at once, where Zenoh reads 64 KiB: 640x480 raw arrives in 0.24 ms instead of 0.36 (medians, two cores)."""
 BATCHES: Final = 16
-"""Of 64 KiB wait to be sent, where Zenoh has room for 2: sending a picture of 640x480 does not block."""
+"""Batches of 64 KiB in the send queue, by default 2: with 16, sending a picture of 640x480 does not block."""
 OPEN_MS: Final = 5000
-"""So long a router may take to say what it is."""
+"""The longest time that a router may take to say what it is."""
 SEND_US: Final = 5_000_000
 """A peer that reads nothing for so long is hung up on."""
 HELD_BYTES: Final = 256 << 20
-"""What waits in one inbox may be so large; what comes then is dropped."""
+"""The most bytes that wait in one inbox; later ones are dropped."""
 EACH_BYTES: Final = 1024
-"""What each item costs beside its bytes."""
+"""The cost of an item beside its bytes."""
 
 Item = TypeVar("Item")
 _log = logging.getLogger(__name__)
@@ -107,12 +107,12 @@ class Node:
     """One node of one session; callable from any thread."""
 
     def __init__(self, session: zenoh.Session, domain_id: int, name: str) -> None:
-        """Announce the node ``/namespace/name`` and listen for all others; raises UsageError for what is no name."""
+        """Announce the node ``/namespace/name`` and listen for all others; raises UsageError for an invalid name."""
         check_node_name(name)
         self.session, self.domain_id, self._name = session, domain_id, name
         self._id = str(session.zid())
         self._numbers = count(1)
-        self._known: dict[tuple[str, str], dict[str, names.Entity]] = {}
+        self._entities: dict[tuple[str, str], dict[str, names.Entity]] = {}
         """(kind, name) -> token -> what it tells."""
         self._lock = Lock()
         with refusals("node"):
@@ -136,14 +136,14 @@ class Node:
     def peers(self, kind: str, entity: names.Entity) -> Iterator[str]:
         """Yield the type hashes of the endpoints of a kind that have the name and type of ``entity``."""
         with self._lock:
-            known = [*self._known.get((kind, entity.name), {}).values()]
-        return (each.type_hash for each in known if each.type_name == entity.type_name)
+            entities = [*self._entities.get((kind, entity.name), {}).values()]
+        return (each.type_hash for each in entities if each.type_name == entity.type_name)
 
     def sessions(self, kind: str, entity: names.Entity, gid: bytes = b"") -> set[str]:
         """Return the sessions of the endpoints of a kind that match ``entity``, or of the one with a ``gid``."""
         with self._lock:
-            known = [*self._known.get((kind, entity.name), {}).items()]
-        matching = (token for token, each in known if each.type_hash == entity.type_hash)
+            entities = [*self._entities.get((kind, entity.name), {}).items()]
+        matching = (token for token, each in entities if each.type_hash == entity.type_hash)
         return {names.session_of(token) for token in matching if not gid or names.gid_of(token) == gid}
 
     def offers(self) -> list[Offer]:
@@ -152,8 +152,8 @@ class Node:
             return Offer(each.name.replace("%", "/"), ros_type_name(each.type_name), reliable)
 
         with self._lock:
-            known = [of_name for (kind, _), of_name in self._known.items() if kind == names.PUBLISHER]
-            return [offer(*item) for of_name in known for item in of_name.items()]
+            publishers = [of_name for (kind, _), of_name in self._entities.items() if kind == names.PUBLISHER]
+            return [offer(*item) for of_name in publishers for item in of_name.items()]
 
     def matching(self, kind: str, entity: names.Entity) -> int:
         """Count the endpoints of a kind to which ``entity`` speaks, or which speak to it."""
@@ -167,13 +167,13 @@ class Node:
             return
         at = (entity.kind, entity.name)
         with self._lock:
-            of_name = self._known.setdefault(at, {})
+            of_name = self._entities.setdefault(at, {})
             if sample.kind == zenoh.SampleKind.PUT:
                 of_name[token] = entity
             else:
                 of_name.pop(token, None)
             if not of_name:
-                del self._known[at]
+                del self._entities[at]
 
 
 @contextmanager
@@ -227,7 +227,7 @@ class Bell:
 
 
 class SampleQueue(Generic[Item]):
-    """What has come in for one endpoint: the last ``depth`` items, all for 0."""
+    """The inbox of one endpoint: the last ``depth`` items, all for 0."""
 
     def __init__(self, name: str, bell: Bell, depth: int = 0) -> None:
         self._name, self._bell, self._depth = name, bell, depth

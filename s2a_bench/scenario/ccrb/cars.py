@@ -20,12 +20,12 @@ NCAP_SPEED_MPS: Final = 50 * KMH
 LEAD_JERK_MPS3: Final = 6.0
 EGO_LEAST_MPS2: Final = -8.0
 LEAST_IMPACT_MPS: Final = 0.5
-"""Slower contacts are no impacts."""
+"""Slower contacts do not count as impacts."""
 SAFETY_M: Final = 2.0
 """Distance to the lead that the start deadline keeps."""
 CAR_WIDTH_M: Final = 2.0
 OUTCOMES: Final = ("none", "front", "rear", "both")
-"""By code: bit 0 is a front impact, bit 1 a rear impact."""
+"""The outcomes by code: bit 0 is a front impact, bit 1 a rear impact."""
 TTC: Final = "s2a-ttc"
 FOLLOWERS: Final[dict[str, str]] = {
     "careful": "s2a_bench.scenario.ccrb.follower:Careful",

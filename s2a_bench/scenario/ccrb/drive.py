@@ -19,7 +19,7 @@ from s2a_bench.scenario.ccrb.outcome import CollisionWatch, Outcomes
 from s2a_bench.scenario.longitudinal import LockStep, Longitudinal, each
 
 NO_LEAD_M: Final = 1e6
-"""At this distance the lead has no effect on the ego."""
+"""A distance at which the lead has no effect on the ego."""
 AFTER_S: Final = 25.0
 """Limit of a roll-out after the end of its plan; nearly all are decided earlier."""
 RECORD_S: Final = 0.01
@@ -161,7 +161,7 @@ class Drive(LockStep):
         return self._outcomes
 
     def trajectory(self) -> Trajectory | None:
-        """Return what was recorded, None without a step of it."""
+        """Return the recorded trajectory, None without a step of it."""
         if not self._records:
             return None
         times_s, states, accelerations, phases, skills = zip(*self._records, strict=True)

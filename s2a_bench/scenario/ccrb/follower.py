@@ -51,7 +51,7 @@ BRAKE: Final = "at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
 
 @dataclass(frozen=True, slots=True)
 class CarMotion:
-    """How a car moves, arrays of shape (M,)."""
+    """The motion of a car, arrays of shape (M,)."""
 
     position_m: Floats
     speed_mps: Floats

@@ -32,7 +32,7 @@ THINKING_PIECES = Fact("thinking_pieces", "", "messages of the answer that were 
 THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")
 
 
-def found_llama_server() -> Path | None:
+def installed_llama_server() -> Path | None:
     """Find llama.cpp's server: on PATH, else in the wheel, which needs the extra for models; None without either."""
     if program := shutil.which("llama-server"):
         return Path(program)
@@ -88,7 +88,7 @@ class Http(ListeningTransport[HttpOptions]):
         options = choice.options
         if options.url:
             return VARIANTS[:2]
-        comparable = choice.engine == "llama" and options.payload in {"", "jpeg"} and found_llama_server()
+        comparable = choice.engine == "llama" and options.payload in {"", "jpeg"} and installed_llama_server()
         return VARIANTS if options.llama_server or comparable else VARIANTS[:3]
 
     def capabilities(self, choice: Choice[HttpOptions]) -> Capabilities[HttpOptions]:
@@ -98,7 +98,7 @@ class Http(ListeningTransport[HttpOptions]):
         """
         options, jpeg = choice.options, self.payloads[:2]
         if choice.variant == LLAMA_SERVER:
-            options = options.but(llama_server=options.llama_server or found_llama_server(), port=0)
+            options = options.but(llama_server=options.llama_server or installed_llama_server(), port=0)
         elif options.llama_server:
             options = options.but(llama_server=None)
         can = replace(super().capabilities(choice), options=options, server="fast" if choice.variant in FAST else "")

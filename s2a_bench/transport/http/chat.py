@@ -43,7 +43,7 @@ def _parsed(document: bytes, what: str, trace: Trace) -> Any:
     try:
         fields = native.FAST.loads(document)
     except ValueError as error:
-        raise RequestFailed(f"{what} is no JSON: {error}") from error
+        raise RequestFailed(f"{what} is not JSON: {error}") from error
     trace.mark("json_parse")
     return fields
 

@@ -43,7 +43,7 @@ UNKNOWN_MODEL = re.compile(
 
 QUOTED = 200
 QUOTED_BYTES = 1 << 16
-"""Characters that are quoted of a body that is no error object."""
+"""Characters that are quoted of a body that is not an error object."""
 
 
 class HttpClient(Client):
@@ -194,7 +194,6 @@ class HttpClient(Client):
             trace.marks.append(("server", first_ns))
 
     def _events(self, response: HttpResponse, body: Iterator[bytes]) -> Iterator[Event]:
-        """Yield the events of an answer."""
         if response.headers.get("content-type") == native.BLOCKS:
             decoder = Decoder(self._dialect, native.read_block, native.Blocks)
         else:
@@ -211,14 +210,14 @@ class HttpClient(Client):
         except httpx.ConnectError as error:
             raise ServerDied(f"nothing answers at {url}: {error}") from error
         except httpx.TimeoutException as error:
-            bounds.left_s()
+            bounds.left_s()  # raises where the deadline, not the silence, was the shorter time-out
             raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}", starting=True) from error
         except httpx.RequestError as error:
             if not self._alive():
                 raise ServerDied(f"the server at {url} has ended: {error}") from error
             raise RequestFailed(f"{url} broke the connection: {error}", starting=True) from error
         except httpx.InvalidURL as error:
-            raise TransportError(f"`url`: '{url}' is no URL: {error}") from error
+            raise TransportError(f"`url`: '{url}' is not a URL: {error}") from error
 
     def close(self) -> None:
         if self._client is not None:
@@ -226,7 +225,7 @@ class HttpClient(Client):
 
 
 def _beginning(body: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield what arrives of a refusal, up to `QUOTED_BYTES`; one that does not end is quoted all the same."""
+    """Yield the beginning of a refusal, up to `QUOTED_BYTES`; one that does not end is quoted all the same."""
     size = 0
     with suppress(RequestFailed, httpx.TimeoutException):
         while size < QUOTED_BYTES and (piece := next(body, b"")):
@@ -237,7 +236,7 @@ def _beginning(body: Iterator[bytes]) -> Iterator[bytes]:
 def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, expected: str) -> RequestFailed:
     try:
         value = json.loads(body)
-    except (ValueError, RecursionError):
+    except (ValueError, RecursionError):  # it is not JSON, or is nested too deep
         value = None
     message = error_in(value) or struck(body)[:QUOTED].strip() or "nothing"
     kind = response.headers.get("content-type", "no content type").partition(";")[0]

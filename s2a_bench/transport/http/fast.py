@@ -48,9 +48,9 @@ class Head:
         except httptools.HttpParserUpgrade:
             pass  # a server may ignore it (RFC 9110, 7.8)
         except httptools.HttpParserError as error:
-            raise Refused(HTTPStatus.BAD_REQUEST, f"no HTTP request: {error}") from error
+            raise Refused(HTTPStatus.BAD_REQUEST, f"not an HTTP request: {error}") from error
         if not self._complete:
-            raise Refused(HTTPStatus.BAD_REQUEST, "no HTTP request")
+            raise Refused(HTTPStatus.BAD_REQUEST, "not an HTTP request")
         self.method, self.path = parser.get_method(), self._url.partition(b"?")[0].decode("latin-1")
         self.chunked = parser.get_http_version() == "1.1"
         self.keep = self.chunked and "close" not in self.value("connection").lower()
@@ -66,7 +66,7 @@ class Head:
 
     def value(self, name: str) -> str:
         """Return the value of a header; several are joined to a list (RFC 9110, 5.3)."""
-        return ", ".join(value for known, value in self.headers if known == name)
+        return ", ".join(value for header, value in self.headers if header == name)
 
     def body_bytes(self, most: int) -> int:
         """Return the length of the body; raises Refused if it is not given, or too large."""
@@ -90,7 +90,7 @@ class FastServer(WebServer):
         return {"server": "a thread a connection", "http": "httptools", "version": httptools.__version__}
 
     def _answer_all(self, wire: Wire) -> None:
-        wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)
+        wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)  # Nagle would hold a token until the last is acknowledged
         early: bytes | None = b""
         try:
             while early is not None:
@@ -193,7 +193,7 @@ class FastExchange(ChatExchange):
         return self._wire.disconnected()
 
     def read(self) -> tuple[Request, bool]:
-        body, self._body = self._body, memoryview(b"")
+        body, self._body = self._body, memoryview(b"")  # freed once it is decoded, before the wait for the engine
         return self._reads(self._head.headers, body, self.trace, self._limits)
 
     def write(self, data: bytes, kind: str, *, last: bool) -> None:

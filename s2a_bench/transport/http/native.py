@@ -109,7 +109,6 @@ class Refused(Exception):
 
     @property
     def answer(self) -> bytes:
-        """Return the answer as bytes of HTTP."""
         return json_answer(self.status, error_json(self.status, str(self)), self.headers, keep=False)
 
 

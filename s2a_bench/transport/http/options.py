@@ -29,7 +29,7 @@ def read_patch(text: str) -> dict[str, Any]:
         patch = json.loads(text or "{}")
         json.dumps(patch, allow_nan=False)
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"`extra_body`: no JSON: {error}") from error
+        raise UsageError(f"`extra_body`: not JSON: {error}") from error
     if not isinstance(patch, dict):
         raise UsageError('`extra_body` should be a JSON object, such as \'{"reasoning_effort": "low"}\'')
     for name, value in secrets_in(patch):

@@ -59,7 +59,7 @@ class Admission:
                 await _refuse(refused, receive, send)
                 return
 
-            async def replay() -> Any:
+            async def replay() -> Any:  # after the body FastAPI waits for the client to disconnect
                 return whole.pop() if whole else await receive()
 
             scope["state"]["arrival"] = Arrival(held)

@@ -30,7 +30,7 @@ HEAD_BYTES: Final = 1 << 20
 PLAIN: Final = re.compile(r"[A-Za-z._-]{0,40}\d{0,2}|v\d\w*")
 """A part of a path that is kept: others may be names of users, or keys."""
 FIRST_MS: Final = PROMPT_MS, METRICS["time_to_first_token_ms"]
-"""What servers report of the time up to the first token."""
+"""The servers' reports of the time up to the first token."""
 FRAMINGS: Final[Mapping[str, Callable[[], Framing]]] = {
     "text/event-stream": ServerSentEvents,
     "application/json": WholeBody,
@@ -197,8 +197,8 @@ class ServerSide(HttpSide):
 
 
 class HttpReader(TapReader):
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(report, known)
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        super().__init__(report, kinds)
         self._requests = ClientSide(self, httptools.HttpRequestParser)
         self._answers = ServerSide(self, httptools.HttpResponseParser)
 

@@ -61,7 +61,7 @@ class Ros(Transport[RosOptions]):
         return (ACTION,) if choice.options.action else super().measured(choice)
 
     def capabilities(self, choice: Choice[RosOptions]) -> Capabilities[RosOptions]:
-        """Return what llama_msgs has fields for: no actions, no state, and in a goal sensor_msgs/Image."""
+        """Return the capabilities that llama_msgs has fields for: no actions or state, in a goal sensor_msgs/Image."""
         can = super().capabilities(choice)
         if choice.variant != ACTION:
             return can

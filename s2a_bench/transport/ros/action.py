@@ -35,7 +35,7 @@ from s2a_bench.types import Piece, Request, Sampling, Token
 ACTION = "/generate_response"
 MARKS = "/marks"
 MEDIA_MARKER = "<__media__>"
-"""Where a picture goes in a llama_ros prompt."""
+"""The place of a picture in a llama_ros prompt."""
 MARKS_TIMEOUT_S = 2.0
 NO_SEED = 2**32 - 1
 """SamplingConfig.seed of a client without a wish."""
@@ -65,11 +65,11 @@ class GenerateClient(RosClient):
         self._name = action or namespace + ACTION
         self._absent = f"no action server appeared at {self._name}"
         self._version = ros.DEFAULT_VERSION  # until a server's type hash shows another
-        self._client = self._found_client()
+        self._client = self._open_client()
         if (spoken := self._client.server_version() or self._version) != self._version:
             self.middleware.close()  # a client of the other version would go on collecting messages that are never read
             self.middleware, self._version = join(self._wiring, "client"), spoken
-            self._client = self._found_client()
+            self._client = self._open_client()
         self._marks = None
         self._origin = self.middleware.subscription(
             self._name.rpartition("/")[0] + wire.PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
@@ -78,7 +78,7 @@ class GenerateClient(RosClient):
             self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
             self.wait_until(lambda: bool(self._marks and self._marks.matched()), self._absent)
 
-    def _found_client(self) -> ActionClient:
+    def _open_client(self) -> ActionClient:
         """Wait for the server; raises TransportError for one that is there and cannot be spoken to."""
         client = self.middleware.action_client(self._name, llama.GENERATE_RESPONSE, self._version)
         try:
@@ -96,7 +96,7 @@ class GenerateClient(RosClient):
         payload = self._wiring.options.payload
         images = [picture_message(frame, payload, self._offset_ns, trace)[1] for frame in request.images]
         sampling: dict[str, Any] = {"grammar": request.grammar}
-        if self._version != "4.4":
+        if self._version != "4.4":  # whose SamplingConfig has no seed
             sampling["seed"] = request.seed
         prompt = MEDIA_MARKER * len(images) + request.prompt
         packed = self._client.pack(llama.generate_goal(prompt, images, version=self._version, **sampling))
@@ -118,7 +118,7 @@ class GenerateClient(RosClient):
                     partial = self._client.unpack_feedback(event.packed).partial_response
                     bounds.count_bytes(len(partial.text))
                     heard.append(partial.text)
-                    if count == limit:
+                    if count == limit:  # sent before the server saw the cancel
                         continue
                     if not count:
                         trace.mark("server" if self._marks is None else "return")
@@ -157,7 +157,7 @@ class GenerateClient(RosClient):
         raise RequestFailed(f"no feedback for {self._wiring.timeout_s:.0f} s")
 
     def _learn(self, goal_id: str, trace: Trace) -> bool:
-        """Take our server's marks of a goal, which were sent before its result; of another, who it is."""
+        """Take our server's marks of a goal, which were sent before its result; of another server, its provenance."""
         if self._marks is None:
             if (marked := self._origin.take(0)) and (origin := wire.readable(self._origin, marked, trace)) is not None:
                 trace.provenance = wire.provenance_of(origin)
@@ -269,7 +269,7 @@ class GoalExchange(RosExchange):
         return not any(stop in text for stop in self._stop)
 
     def _feed(self) -> None:
-        """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
+        """Send the held tokens as one feedback: one, or several that came faster than ROS clients' queues hold."""
         if self._held:
             self._goal.feedback(llama.token_feedback("".join(self._held), self._tokens[-1].id, self._source.version))
             self._held.clear()

@@ -34,7 +34,7 @@ FRAME_ID = "camera"
 PIXELS = frozenset({"raw", "yuyv"})
 """Payloads that are sensor_msgs/Image; the others are CompressedImage."""
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
-"""By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
+"""The QoS of ROS 2's profiles, by name; a reliable subscription does not match a best-effort publisher."""
 CLOCK, CLOCK_QOS = "/clock", QoS(depth=1, reliable=False)
 """Simulated time, as a simulator or a replayed recording publishes it."""
 POLL_S = 0.5
@@ -99,7 +99,7 @@ class CachedFrame:
     frame: Frame
     marks: list[Mark]
     count: int
-    """How many frames had arrived with this one."""
+    """The number of frames up to this one."""
 
     @property
     def received_ns(self) -> int:
@@ -202,7 +202,7 @@ class CameraCache:
         return self._newest
 
     def silence(self) -> str:
-        """Return what to look at where no frame comes although the topics have publishers; "" where they have none."""
+        """Return the places to look at if no frame comes although the topics have publishers; "" if they have none."""
         counts = self._publishers().items()
         present = ", ".join(f"{count} publisher{'s' if count > 1 else ''} on {topic}" for topic, count in counts)
         if not present:
@@ -233,13 +233,13 @@ class CameraCache:
                 if packed is not None:
                     self._keep(camera, packed)
                     self._unused = ""
-            except Exception as error:  # noqa: BLE001 - an unusable frame is no reason to stop
+            except Exception as error:  # noqa: BLE001 - the camera survives an unusable frame
                 self._unused = str(error) or type(error).__name__
                 self._once.warning(self._unused, "camera frame not used: %s", self._unused)
 
     def _follow(self, clock: Subscription) -> None:
         while not self._stopped:
-            with suppress(TransportError):
+            with suppress(TransportError):  # of a message that cannot be read; the next may be
                 if (packed := clock.take(POLL_S)) is not None:
                     self._sim_ns = ros.nanoseconds(clock.unpack(packed).clock)
 

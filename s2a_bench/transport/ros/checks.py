@@ -1,4 +1,4 @@
-"""What the doctor checks for ROS: the interfaces of DDS and its buffers, a ROS 2 installation, a middleware."""
+"""The doctor's checks for ROS: the interfaces of DDS and its buffers, a ROS 2 installation, a middleware."""
 
 from __future__ import annotations
 

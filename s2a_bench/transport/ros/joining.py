@@ -23,7 +23,7 @@ from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 T = TypeVar("T")
 AT = "@"
-"""In an address, between the namespace and the meeting place that the server is itself."""
+"""The separator in an address between the namespace and the meeting place that the server hosts itself."""
 MATCH_TIMEOUT_S = 15.0
 SETTLE_S = 0.3
 """Time to discover a server that is there already."""
@@ -36,7 +36,7 @@ def namespace_of(wiring: Wiring[RosOptions]) -> str:
 
 
 def domain_of(wiring: Wiring[RosOptions]) -> int:
-    """Return the DDS domain; raises UsageError for a ROS_DOMAIN_ID that is none."""
+    """Return the DDS domain; raises UsageError for an invalid ROS_DOMAIN_ID."""
     return domain_id(os.environ, wiring.options.domain_id)
 
 
@@ -111,7 +111,7 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
 
 
 class RosClient(Client):
-    """What the clients of both variants have: a node, the server's camera, and messages that they wait for."""
+    """The base of both variants' clients: a node, the server's camera, and waiting for messages."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the server; raises ServerDied if it does not appear."""
@@ -125,7 +125,7 @@ class RosClient(Client):
             raise
 
     def _meet_server(self, namespace: str) -> None:
-        """Make what the client needs and wait until the server has matched it; raises TransportError."""
+        """Make the client's endpoints and wait until the server has matched them; raises TransportError."""
         raise NotImplementedError
 
     @cached_property
@@ -151,7 +151,7 @@ class RosClient(Client):
             )
 
     def taken(self, take: Callable[[float], T | None], bounds: Bounds) -> Iterator[T | None]:
-        """Yield what comes, None where nothing came for a moment, until the longest silence is over."""
+        """Yield messages as they come, None if none came for a moment, until the longest silence is over."""
         deadline_ns = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline_ns:
             yield take(min(POLL_S, bounds.left_s()))

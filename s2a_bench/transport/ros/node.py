@@ -1,4 +1,4 @@
-"""What makes our server a node that behaves: parameters, its log on ``/rosout`` and ``/diagnostics`` once a second."""
+"""The usual interfaces of a ROS 2 node: parameters, its log on ``/rosout``, and ``/diagnostics`` once a second."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
 KEY_VALUE: Final = "diagnostic_msgs/msg/KeyValue"
 DIAGNOSTICS: Final = "/diagnostics"
 DIAGNOSTICS_QOS: Final = QoS(depth=1)
-"""That of ROS's diagnostic_updater."""
+"""The QoS of ROS's diagnostic_updater."""
 LOG: Final = "rcl_interfaces/msg/Log"
 ROSOUT_QOS: Final = QoS(depth=1000, latched=True, lifespan_s=10.0)
 """ROS's ``rcl_qos_profile_rosout_default``."""

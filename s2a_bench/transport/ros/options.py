@@ -9,7 +9,7 @@ from pydantic import create_model, field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
-from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, chosen
+from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, middleware_kind
 from s2a_bench.ros.join import PLACES
 from s2a_bench.ros.remap import ABSOLUTE, RULE
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
@@ -23,7 +23,7 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 
 
 class DomainOptions(TransportOptions):
-    """Where a server is; the meeting places of middlewares follow."""
+    """The options that locate a server; the meeting places of middlewares follow."""
 
     PANEL: ClassVar[str] = "ROS 2"
 
@@ -138,4 +138,4 @@ class RosOptions(PlaceOptions):
 
     @property
     def kind(self) -> MiddlewareKind:
-        return chosen(self.middleware)
+        return middleware_kind(self.middleware)

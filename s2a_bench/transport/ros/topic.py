@@ -62,7 +62,7 @@ class TopicClient(RosClient):
             raise RequestFailed(f"the server broke off: {token.error}")
 
     def _next(self, name: str, trace: Trace, bounds: Bounds) -> Any:
-        """Wait for the next token of this request, dropping what belongs to others and what is none."""
+        """Wait for the next token of this request; drop other clients' messages and malformed ones."""
         for packed in self.taken(self._subscription.take, bounds):
             if packed is not None:
                 token = wire.readable(self._subscription, packed, trace)
@@ -83,7 +83,7 @@ class TopicSource:
         self.take, self.sender, self.interrupt = self._requests.take, self._requests.sender, self._requests.interrupt
 
     def exchange(self, packed: Any, shared: Shared, trace: Trace) -> TopicExchange:
-        """Unpack a request; raises TransportError for bytes that are none."""
+        """Unpack a request; raises TransportError for malformed bytes."""
         message = self._requests.unpack(packed)
         trace.mark("cdr_parse")
         return TopicExchange(self, message, shared, trace)
@@ -92,7 +92,7 @@ class TopicSource:
         return len(packed)
 
     def refuse(self, packed: Any, why: str) -> None:
-        """Answer a request with an error only; raises TransportError for bytes that are no request."""
+        """Answer a request with an error only; raises TransportError for malformed bytes."""
         request_id = self._requests.unpack(packed).id
         marks = [wire.marks_message(request_id, Trace().to_remote())]
         self.send(request_id, self.sender(), Token(0, "", -1), marks, why)

@@ -1,4 +1,4 @@
-"""What travels beside pictures: requests, tokens and marks as messages of s2a_msgs, and their quality of service."""
+"""The payloads beside pictures: requests, tokens and marks as messages of s2a_msgs, and their quality of service."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROVENANCE_TOPIC: Final = "/provenance"
 
 
 def readable(subscription: Subscription, packed: Any, trace: Trace) -> Any | None:
-    """Unpack a message; None for bytes that are none, which are counted as a fact: they are not this request's."""
+    """Unpack a message; None for malformed bytes, which are counted as a fact: they are not this request's."""
     try:
         return subscription.unpack(packed)
     except TransportError:
@@ -67,7 +67,7 @@ def pieces_of(message: Any) -> list[Piece]:
     pieces: list[Piece] = []
     for actions in message.actions:
         if not actions.dims or len(actions.values) % actions.dims:
-            raise RequestFailed(f"{len(actions.values)} numbers are no actions of {actions.dims}")
+            raise RequestFailed(f"{len(actions.values)} numbers are not actions of {actions.dims}")
         pieces += actions_of(actions.values.reshape(-1, actions.dims), message.index + len(pieces))
     return pieces
 
@@ -110,4 +110,4 @@ def remote_of(marks: Any) -> Remote:
             provenance=provenance_of(marks.provenance),
         ).check()
     except ValueError as error:
-        raise RequestFailed(f"the server's marks are none: {error}") from error
+        raise RequestFailed(f"the server's marks are malformed: {error}") from error

@@ -92,7 +92,7 @@ CLIENTS = (
     Case("half a surrogate pair", asks(fields().replace(b'"go"', b'"\\ud800"')), "internal error|surrogate"),
     Case("max_tokens 2^40", asks(fields(max_tokens=1 << 40)), "max_tokens"),
     Case("a state of texts", asks(fields(state=["x"])), "the state"),
-    Case("a picture of other sides", asks(picture(width=5) + bytes(24), len(picture(width=5))), "no such picture"),
-    Case("a picture that is not there", asks(picture()), "no such picture"),
+    Case("a picture of other sides", asks(picture(width=5) + bytes(24), len(picture(width=5))), "not such a picture"),
+    Case("a picture that is not there", asks(picture()), "not such a picture"),
 )
 LARGE = (Case("a picture of 900 million pixels", asks(BOMB + bomb(), len(BOMB)), "pixels"),)

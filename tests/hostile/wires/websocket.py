@@ -51,7 +51,7 @@ def asks(*pieces: Any, **more: Any) -> Attack:
 
 
 GO = says({"prompt": "go on"})
-ERROR = "that are no message|no such picture|error|Error"
+ERROR = "that are not a message|not such a picture|error|Error"
 LINES = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
 FRAGMENT = frame(bytes(MIB), Opcode.CONT, fin=False)
 
@@ -101,7 +101,7 @@ SERVERS = (
     Server("a page", answers(b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nhi"), "^RequestFailed: .*answered 200"),
     Server("endless headers", answers(b"HTTP/1.1 101 Yes\r\n", again=b"x: y\r\n" * 1000), timeout_s=0.5),
     Server("an accept that fits nothing", answers(lambda *_: accepted(*_[:1], b"")), "^RequestFailed: .*Accept"),
-    Server("a greeting that is no message", answers(accepted, frame(b"\xc1", mask=False)), "no message"),
+    Server("a greeting that is no message", answers(accepted, frame(b"\xc1", mask=False)), "not a message"),
     Server("a greeting, then silence", greets(), "^RequestFailed: .*silent", timeout_s=0.5),
     Server("a frame with a mask", greets(frame(msgpack.packb(CHUNK))), timeout_s=0.5),
     Server("marks that are none", greets(says(CHUNK, mask=False), says({"s2a": [5]}, mask=False)), "marks"),

@@ -211,7 +211,7 @@ def test_settings_come_back_as_they_were(monkeypatch: pytest.MonkeyPatch) -> Non
             "carla?port=0",
             "carla: port = '0': input should be greater than or equal to 1; its parameters are host, port",
         ),
-        ("carla?town=1", "carla: 'town' is no parameter; its parameters are host, port, timeout_s, vehicle"),
+        ("carla?town=1", "carla: 'town' is not a parameter; its parameters are host, port, timeout_s, vehicle"),
     ],
 )
 def test_wrong_parameters_are_one_line(written: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,5 +76,5 @@ def test_successes_are_those_of_a_plain_loop_and_of_before(tmp_path: Path, task:
 
 
 def test_a_prompt_that_is_no_task_is_one_line() -> None:
-    with pytest.raises(ValueError, match="prompt 'fly' is no task of Meta-World"):
+    with pytest.raises(ValueError, match="prompt 'fly' is not a task of Meta-World"):
         expert((), np.zeros(39, np.float32), "fly")

@@ -287,11 +287,11 @@ class Foreign:
 @pytest.mark.parametrize(
     ("body", "says"),
     [
-        (lambda _: b"abc", "sent what is no answer"),
+        (lambda _: b"abc", "sent a malformed answer"),
         (lambda number: SLICE.pack(number, 0) + b'["token", 0', "broke off"),
         (lambda number: SLICE.pack(number, 0) + b'["token", 0, 1, 2]\n', "a line of an unknown kind"),
-        (lambda number: SLICE.pack(number, 0) + b'["action", 0, ["x"]]\n', "no array of numbers|not numbers"),
-        (lambda number: SLICE.pack(number, 0) + b"{]\n", "sent what is no answer"),
+        (lambda number: SLICE.pack(number, 0) + b'["action", 0, ["x"]]\n', "not an array of numbers|not numbers"),
+        (lambda number: SLICE.pack(number, 0) + b"{]\n", "sent a malformed answer"),
         (lambda number: SLICE.pack(number, 0) + packed("the engine has had enough"), "had enough"),
         (lambda number: SLICE.pack(number, 1) + packed(Token(1, "b")), "pieces of the answer of foreign were lost"),
         (lambda number: SLICE.pack(number + 1, 0) + packed("of another request"), "broke off: it gave the request up"),

@@ -165,7 +165,7 @@ def policy_of(handler: Handler, seen: Any) -> bytes | None:
 FAULTS = {
     "nothing": (lambda _: None, "without a chunk: its policy raised an error, .* as another client took it"),
     "another's": (lambda seen: chunk(seen.timestamp + 1, CHUNK), "the observation of another client"),
-    "no pickle": (lambda _: b"what", "no chunk of lerobot's"),
+    "no pickle": (lambda _: b"what", "not a chunk of lerobot's"),
     "no number": (lambda seen: chunk(seen.timestamp, CHUNK * np.float32(np.nan)), "not finite"),
     "too much": (lambda _: bytes(5 << 20), "more than 4 MiB"),
 }
@@ -198,7 +198,7 @@ def test_a_silent_server_is_given_up() -> None:
 
 
 def test_where_nothing_listens_the_run_ends_and_another_grpc_server_is_named_so() -> None:
-    foreign = pytest.raises(RequestFailed, match="no policy server of lerob")
+    foreign = pytest.raises(RequestFailed, match="not a policy server of lerob")
     with grpc_server() as url, robot(url) as opened, foreign:
         ask(opened, request())
     with robot(url) as opened, pytest.raises(ServerDied, match=f"no gRPC server answers at {url}"):
@@ -225,7 +225,7 @@ def test_a_template_with_what_lerobot_does_not_take_is_refused(tmp_path: Path) -
     path = tmp_path / "chw.toml"
     path.write_text('front = "{image:0|CHW}"\nstate = "{state}"')
     options = GrpcOptions(**ACT, pretrained="x", template=str(path))
-    with pytest.raises(UsageError, match="front is no"):
+    with pytest.raises(UsageError, match="front must be a picture"):
         GRPC.require(Choice(options, state=2))
 
 
@@ -263,9 +263,9 @@ def bombs(path: Path) -> dict[str, tuple[bytes, str]]:
         "another type": (answer(action(1.0, storage(CHUNK, kind="UntypedStorage"), 0, 3)), "torch.UntypedStorage"),
         "unequal": (answer(action(1.0, KEPT, 0, 3), action(1.0, KEPT, 0, 2)), "different lengths"),
         "too many numbers": (answer(*[action(1.0, LARGE, 0, 12 << 15)] * 3), "more than 1048576"),
-        "no list": (b"\x80\x02}.", "no chunk"),
-        "an attribute of a name": (answer(REBUILD + b"}" + text("x") + b"Nsb"), "no chunk"),
-        "half": (answer(action(1.0, KEPT, 0, 3))[:-30], "no chunk"),
+        "no list": (b"\x80\x02}.", "not a chunk"),
+        "an attribute of a name": (answer(REBUILD + b"}" + text("x") + b"Nsb"), "not a chunk"),
+        "half": (answer(action(1.0, KEPT, 0, 3))[:-30], "not a chunk"),
     }
 
 

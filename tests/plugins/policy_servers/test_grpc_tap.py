@@ -305,7 +305,7 @@ def test_what_would_take_memory_is_refused(frames: list[Frame]) -> None:
 
 
 def test_http_1_is_refused() -> None:
-    with pytest.raises(ValueError, match="no HTTP/2"):
+    with pytest.raises(ValueError, match="not HTTP/2"):
         replayed(GrpcReader, [(b"GET / HTTP/1.1\r\nHost: robot\r\n\r\n", True)])
 
 

@@ -40,9 +40,9 @@ def unpack(data: Any) -> Any:
 @pytest.mark.parametrize("read", [unpackb, unpack])
 def test_lists_and_maps_have_not_more_elements_than_are_read(read: Callable[[bytes], Any]) -> None:
     read(msgpack.packb({str(number): [0] * LIST for number in range(MAP)}))
-    with pytest.raises(RequestFailed, match="no message"):
+    with pytest.raises(RequestFailed, match="not a message"):
         read(msgpack.packb({str(number): 0 for number in range(MAP + 1)}))
-    with pytest.raises(RequestFailed, match="no message"):
+    with pytest.raises(RequestFailed, match="not a message"):
         read(msgpack.packb([0] * (LIST + 1)))
 
 
@@ -64,7 +64,7 @@ def test_an_array_with_gaps_travels_as_its_elements(write: Write, read: Callable
 @codecs
 def test_what_is_no_value_does_not_travel(write: Write, read: Callable[[bytes], Any]) -> None:
     assert read(write({"a": None})) == {"a": None}
-    with pytest.raises(RequestFailed, match="object is none of its types"):
+    with pytest.raises(RequestFailed, match="object is not one of its types"):
         write({"a": object()})
 
 
@@ -138,7 +138,7 @@ ARRAYS_THAT_ARE_NONE = {
     [*product(HOSTILE, (unpackb, unpack)), *product(ARRAYS_THAT_ARE_NONE, (unpackb,))],
 )
 def test_bytes_that_are_no_message_are_refused_in_a_line(name: str, read: Callable[[bytes], Any]) -> None:
-    with pytest.raises(RequestFailed, match=r"bytes that are no message: .") as failed:
+    with pytest.raises(RequestFailed, match=r"bytes that are not a message: .") as failed:
         read((HOSTILE | ARRAYS_THAT_ARE_NONE)[name])
     assert str(failed.value).isprintable()
     assert len(str(failed.value)) < 300

@@ -102,11 +102,11 @@ def deep() -> Any:
     ("content", "says"),
     [
         ([], "should be a table"),
-        ({"a": "{picture}"}, "a has a brace that is no place"),
-        ({"a": {"b": ["x", "{image:a}"]}}, r"a.b\[1\] has a brace that is no place"),
+        ({"a": "{picture}"}, "a has an unknown place"),
+        ({"a": {"b": ["x", "{image:a}"]}}, r"a.b\[1\] has an unknown place"),
         ({"a": "{image:0|BGR}"}, "a wants picture 0 as BGR"),
         ({"a": "{image:99}"}, "a wants picture 99"),
-        ({"a": "{state:7:7}"}, "a wants the numbers 7:7 of the state, which are none"),
+        ({"a": "{state:7:7}"}, "a wants the numbers 7:7 of the state: an empty range"),
         ({"a": object()}, "which no observation can hold"),
         ({"a": 1, "a?": 2}, "a is twice there"),
         ({"?": 1}, "empty"),
@@ -157,10 +157,10 @@ def test_toml_and_json_say_the_same(tmp_path: Path, name: str, text: str) -> Non
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
-        ("a.json", "{", "no JSON"),
+        ("a.json", "{", "not JSON"),
         ("a.json", '{"a": 1, "a": 2}', "a key is twice there"),
         ("a.json", "[" * 50_000, "too deep"),
-        ("a.toml", "a = ", "no TOML"),
+        ("a.toml", "a = ", "not TOML"),
         ("a.toml", "a = 2020-01-01", "which no observation can hold"),
     ],
 )
@@ -170,7 +170,7 @@ def test_a_file_that_cannot_be_read_is_refused_in_a_line(tmp_path: Path, name: s
         template_of(str(tmp_path / name))
 
 
-@pytest.mark.parametrize(("name", "says"), [("vllm-omni", "is none of aloha, droid"), ("no/such.toml", "cannot read")])
+@pytest.mark.parametrize(("name", "says"), [("vllm-omni", "not one of aloha, droid"), ("no/such.toml", "cannot read")])
 def test_an_unknown_name_is_refused(name: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         template_of(name)
@@ -228,7 +228,7 @@ def test_files_are_decoded(whole: bool) -> None:
         ({"a": [PICTURE] * 99}, "more than 64 pictures"),
         ({"a": np.zeros((64, 64, 3))}, "a: a state of more than 4096 numbers; pictures are uint8"),
         ({"a": float("nan")}, "not finite"),
-        ({"prompt": "\ud800"}, "no Unicode text"),
+        ({"prompt": "\ud800"}, "not Unicode text"),
         ({"a": np.zeros((40, 80, 3), np.uint8)}, "at most 3000 pixels"),
         (deep(), "in each other"),
     ],
@@ -259,6 +259,6 @@ MARKS = Remote("c", [("queue", 1)], [2])
 )
 def test_marks_come_back_and_those_that_are_none_are_refused_in_a_line(message: Any) -> None:
     assert remote_of({EXTENSION: MARKS.to_json()}) == MARKS
-    with pytest.raises(RequestFailed, match=r"^what should be the server's marks is none: .") as failed:
+    with pytest.raises(RequestFailed, match=r"^the server's marks are malformed: .") as failed:
         remote_of(message)
     assert str(failed.value).isprintable()

@@ -91,9 +91,9 @@ def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], st
     [
         ("", '"error"', "the server answered 'error'; the reason is in the server's output"),
         ("", '{"detail": "no such route"}', "broke off: no such route"),
-        ("", "null", "no finite numbers"),
+        ("", "null", "finite numbers"),
         ("", "[[1], [1, 2]]", "not the dialect 'openvla'"),
-        ("", "[NaN]", "no finite numbers"),
+        ("", "[NaN]", "finite numbers"),
         ("", '{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "not the dialect 'openvla'"),
         ("", '{"__numpy__": "AAAA", "dtype": "<f8", "shape": [7]}', "not the dialect 'openvla'"),
         ("", "{}", "not the dialect 'openvla'"),
@@ -103,7 +103,7 @@ def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], st
         ("x-vla", '{"action": null}', "not numbers of shape"),
         ("x-vla", '{"error": "Request failed"}', "broke off: Request failed"),
         ("openvla-oft", '"error"', "the server answered 'error'; the reason is in the server's output"),
-        ("openvla-oft", "[[1], [1, 2]]", "no array of numbers"),
+        ("openvla-oft", "[[1], [1, 2]]", "not an array of numbers"),
     ],
 )
 def test_what_is_no_action_is_a_failure(template: str, body: str, message: str) -> None:

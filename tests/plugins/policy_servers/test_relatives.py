@@ -290,7 +290,7 @@ def test_a_picture_is_a_map_for_vla_eval_alone() -> None:
         ("openpi", "Traceback (most recent call last):\n  File x\nKeyError: 'state'\n", "File x KeyError: 'state'"),
         ("openpi", {"actions": np.full((2, 2), np.nan)}, "actions: not finite numbers"),
         ("openpi", {"actions": "up"}, "actions: .*"),
-        ("openpi", b"\xc1", "bytes that are no message.*"),
+        ("openpi", b"\xc1", "bytes that are not a message.*"),
         ("openpi", {"actions": CHUNK, "more": bytes(20 << 20)}, r"sent more than \d+ bytes.*"),
         ("starvla", {"data": {"action": 1}}, "an answer without data.actions: action"),
         ("sglang-realtime", {"data": []}, "an answer without data.0.action.values: list"),

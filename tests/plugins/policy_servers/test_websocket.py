@@ -148,7 +148,7 @@ def test_health_and_pings_are_answered_while_a_request_runs() -> None:
     ("piece", "message", "says", "code"),
     [
         (CHUNK[0], "an observation as text", "a binary message, not a text", 1003),
-        (CHUNK[0], b"\xc1", "bytes that are no message", 1011),
+        (CHUNK[0], b"\xc1", "bytes that are not a message", 1011),
         ("a token", packb({"prompt": "go"}), "choose `answer` actions", 1011),
     ],
 )

@@ -349,7 +349,7 @@ class TestBlackBox:
         with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address) as client:
             ask(client, Request("a", "go"))
             server.stop()
-            until(lambda: not client._link.stands())  # type: ignore[attr-defined]
+            until(lambda: not client._connection.stands())  # type: ignore[attr-defined]
             with served(wiring_of("zmq/gr00t", server.address.partition("//")[2]), RecordingHandler(list(CHUNK))):
                 actions, trace = ask(client, Request("b", "go"))
         assert len(actions) == len(CHUNK)

@@ -429,5 +429,5 @@ def test_any_packages_wall_clock_may_be_chosen(monkeypatch: pytest.MonkeyPatch) 
     offered = EntryPoint("gps", "somebodys_gps:clock", WALL_CLOCKS.group)
     monkeypatch.setitem(WALL_CLOCKS._offered, "gps", offered)
     assert HostOptions(clock="gps").clock == "gps"
-    with pytest.raises(UsageError, match="'sundial' is none of chrony, ptp, gps"):
+    with pytest.raises(UsageError, match="'sundial' is not one of chrony, ptp, gps"):
         HostOptions(clock="sundial")

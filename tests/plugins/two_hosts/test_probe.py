@@ -16,7 +16,7 @@ import pytest
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.two_hosts.links import CLIENT, SERVER
 from s2a_bench.plugins.two_hosts.links import probe as room
-from s2a_bench.plugins.two_hosts.links.probe import Found, probed
+from s2a_bench.plugins.two_hosts.links.probe import Measurement, probed
 from s2a_bench.plugins.two_hosts.links.relay import Shaper
 from s2a_bench.plugins.two_hosts.profiles import Direction, Step, load_link
 
@@ -100,7 +100,7 @@ class Link:
 
 def quantities(
     patch: pytest.MonkeyPatch, directions: tuple[Direction, Direction], carried: tuple[Direction, Direction]
-) -> dict[str, Found]:
+) -> dict[str, Measurement]:
     """Probe once a link that carries ``carried`` instead of its ``directions``."""
     net = Net(*carried)
     patch.setattr(room, "_socket", lambda address, _: Socket(net, address))
@@ -190,7 +190,7 @@ def test_a_trace_is_not_checked_and_an_attempt_is_repeated_until_nothing_is_off(
     changing = Direction(1, steps=(Step(0, 1, 0, 0),), period_s=1)
     for ways in ((changing, Direction(1)), (Direction(1), changing)):
         assert quantities(monkeypatch, ways, ways) == {}
-    good, bad = Found("rate up", "Mbit/s", 100, 95, 5), Found("rate up", "Mbit/s", 100, 94.9, 5)
+    good, bad = Measurement("rate up", "Mbit/s", 100, 95, 5), Measurement("rate up", "Mbit/s", 100, 94.9, 5)
     assert (good.off, bad.off, replace(good, measured=105.1).off, replace(good, measured=math.nan).off) == (0, 1, 1, 1)
     attempts = iter([[bad], [good, bad], [good]])
     monkeypatch.setattr(room._Probe, "measure", lambda _: iter(next(attempts)))

@@ -53,7 +53,7 @@ def test_a_link_is_a_name_a_file_or_pairs(
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("4", "'4' is none of"),
+        ("4", "'4' is not one of"),
         ("rate=x", "'rate=x' should be KEY=NUMBER"),
         ("rate=0", "up_mbps: 0.0 should be greater than 0"),
         ("loss=100%", "loss: 1.0 should be less than 1"),

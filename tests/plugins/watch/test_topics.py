@@ -173,7 +173,7 @@ def test_a_bound_ends_the_reading(tmp_path: Path, options: dict[str, Any], asked
 @pytest.mark.parametrize("lines", [b"", b"no recording"])
 def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path, lines: bytes) -> None:
     (tmp_path / "x.mcap").write_bytes(lines)
-    with pytest.raises(SourceError, match=r"^`bag`: .*x.mcap is no recording that can be read"):
+    with pytest.raises(SourceError, match=r"^`bag`: .*x.mcap is not a recording that can be read"):
         read_bag(tmp_path / "x.mcap", tmp_path / "out")
 
 
@@ -227,7 +227,7 @@ def test_a_recording_has_no_domain(tmp_path: Path) -> None:
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 def test_a_time_out_of_all_bounds_is_damage(tmp_path: Path, plugin: StoragePlugin) -> None:
     path = record(tmp_path / "bag", [(0, CAMERA, image(1)), (5 * 10**12, TOKENS, string("x"))], plugin)
-    with pytest.raises(SourceError, match=r"^`bag`: .* is no recording that can be read \(a message of the time 6"):
+    with pytest.raises(SourceError, match=r"^`bag`: .* is not a recording that can be read \(a message of the time 6"):
         read_bag(path, tmp_path / "out")
 
 

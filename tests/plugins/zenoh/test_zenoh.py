@@ -49,7 +49,7 @@ def router_inside(endpoint: str, domain: int) -> AbstractContextManager[Join]:
 
 @contextmanager
 def router_apart(endpoint: str, domain: int) -> Iterator[Join]:
-    """Join sessions that meet at a router that is none of them."""
+    """Join sessions that meet at a router that is not one of them."""
     with router_inside(endpoint, domain) as join:
         join()
         yield join
@@ -234,7 +234,7 @@ def test_malformed_requests_leave_an_action_up(routed: Join, stranger: Any, capl
     damaged[20:24] = b"\xff\xff\xff\x7f"  # the prompt's length
     action.client.send(damaged)
     goal = receive(action.server)
-    with pytest.raises(TransportError, match="received bytes that are no llama_msgs/action/GenerateResponse_SendGoal"):
+    with pytest.raises(TransportError, match="bytes that are not a llama_msgs/action/GenerateResponse_SendGoal"):
         goal.unpack()
     goal.reject()
     event(action.client, Rejected)

@@ -22,7 +22,7 @@ from s2a_bench.transport import ACTIONS, TOKENS
 
 PLAN_EVERY_S: Final = 2.0
 FEWEST_PLANS: Final = 3
-"""Of a robot, in the time that counts."""
+"""The fewest plans of a robot in the measured time."""
 SETTLE_S: Final = 5.0
 LIMITS: Final = "stalled=1%, latency_p99=300ms, ttft_p99=300ms, age_p99=200ms; p50 as well as p99"
 _LIMIT: Final = re.compile(r"(stalled)=(\d+\.?\d*)%?|((?:latency|ttft|age)_p(50|99))=(\d+\.?\d*)(ms|s)")
@@ -30,7 +30,7 @@ _LIMIT: Final = re.compile(r"(stalled)=(\d+\.?\d*)%?|((?:latency|ttft|age)_p(50|
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What a fleet may not exceed: at most ``share`` of the values of a metric are above ``value``.
+    """A limit on fleets: at most ``share`` of the values of a metric are above ``value``.
 
     The values of ``stalled`` are 1 for a tick, or a plan, that stalls, else 0; all others are in ns.
     """
@@ -58,22 +58,22 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class RobotLoad:
-    """What each robot of a fleet does: act on chunks in a mode, request a plan every so often, or a closed loop."""
+    """The load of each robot of a fleet: chunks in an acting mode, a plan per period, or a closed loop."""
 
     setting: ControlSetting
     mode: Mode | None = None
     """None: robots without a control clock."""
     name: str = ""
-    """The canonical name of the mode."""
+    """The canonical name of the acting mode."""
     seed: int = 0
     every_ns: int = 0
-    """Between the plans of a robot; 0 and no mode: closed loop."""
+    """The period of a robot's plans; 0 and no mode: closed loop."""
     think_ns: int = 0
     """Closed loop: from an answer to the next request."""
     episode_ns: int = 0
     """The robots start together every so often; 0: once, at random moments of their first cycle."""
     settle_ns: int = 0
-    """After a start, left out of what is measured."""
+    """The time after a start that is not measured."""
 
     @property
     def cycle_ns(self) -> int:
@@ -98,10 +98,10 @@ class RobotLoad:
 
 @dataclass(frozen=True, slots=True)
 class SearchPlan:
-    """Which fleets are tried, for how long, and what they may not exceed."""
+    """The fleets to try, the time for each, and their limit."""
 
     numbers: Sequence[int]
-    """Of robots, ascending."""
+    """The numbers of robots, ascending."""
     bisects: bool
     """Whether the search ends at the first fleet beyond the limit, and bisects from there."""
     limit: Limit | None
@@ -186,7 +186,7 @@ class CapacityOptions(ControlOptions):
 
     @property
     def loads(self) -> Sequence[RobotLoad]:
-        """What the robots do: act in each mode, or the one thing that they do without chunks."""
+        """The loads of the robots: one for each acting mode, or the one load without chunks."""
         episode_ns = round(self.episodes_s * 1e9)
         load = RobotLoad(self.setting, seed=self.seed, episode_ns=episode_ns, settle_ns=self.settle_ns)
         if self.load == "chunks":
@@ -206,7 +206,7 @@ class CapacityOptions(ControlOptions):
 
     @cached_property
     def load(self) -> Literal["chunks", "plans", "closed"]:
-        """What the robots do; those of a server without actions ask for plans."""
+        """The kind of load; robots of a server without actions request plans."""
         if self.closed_loop:
             return "closed"
         return "chunks" if self.answer == ACTIONS else "plans"
@@ -223,10 +223,10 @@ class CapacityOptions(ControlOptions):
             raise UsageError(f"`episodes`: {self.episodes_s:g} s need a control clock, and two of its ticks")
         if self.episodes_s and self.settle_ns >= self.episodes_s * 1e9:
             raise UsageError(f"`settle`: {self.settle_s:g} s leave nothing of an episode of {self.episodes_s:g} s")
-        limit, given = self.search.limit, self.model_fields_set
-        if "think_s" in given and not self.closed_loop:
+        limit, fields = self.search.limit, self.model_fields_set
+        if "think_s" in fields and not self.closed_loop:
             raise UsageError("`think` needs `closed_loop`")
-        if "modes" in given and self.load != "chunks":
+        if "modes" in fields and self.load != "chunks":
             raise UsageError("`modes` are ways to act on chunks of actions; leave them out without chunks")
         least_s = FEWEST_PLANS * self.plan_ns / 1e9
         acts_s = self.episodes_s - self.settle_ns / 1e9 if self.episodes_s else self.seconds

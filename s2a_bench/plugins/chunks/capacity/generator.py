@@ -45,27 +45,27 @@ from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.types import Frame, Piece
 
 STRIDE: Final = 1 << 20
-"""Between the numbers of two requests of a robot, so that those of different robots differ."""
+"""The step between the numbers of a robot's requests, so that those of different robots differ."""
 PATIENCE_S: Final = 2.0
-"""For answers under way when a fleet is stopped by an error."""
+"""Time for running answers when a fleet is stopped by an error."""
 FREE_CORE_S: Final = 60.0
-"""How long a process waits for a core of the cluster."""
+"""The longest wait of a process for a core of the cluster."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetPlan:
-    """What the robots of a fleet have in common; a process gets it as it is."""
+    """The settings that the robots of a fleet share; they are sent to each process."""
 
     cell: str
     wiring: Mapping[str, Any]
-    """As `Wiring.to_json`."""
+    """The result of `Wiring.to_json`."""
     requests: RunPlan
-    """Without its cells."""
+    """The run plan, without its cells."""
     load: RobotLoad
     first: int = 0
     """Place in the run before those of its requests."""
     own: Pipeline | None = None
-    """To a server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
+    """The server that each process starts for its own robots; None: all share that of `wiring`."""
     origin: Provenance = UNKNOWN_ORIGIN
 
 
@@ -118,7 +118,7 @@ class Timed:
 
     intended_ns: int
     late_ns: int
-    """Of the generator: after its intended time, or the answer before it; -1: not requested."""
+    """Lateness of the generator, after the intended time or the previous answer; -1: not requested."""
     at_ns: list[int] = field(default_factory=list)
     """Times of its pieces."""
     whole_ns: int = -1
@@ -214,8 +214,6 @@ class _Shared(Stamped):
 
 
 class Fleet:
-    """The robots of this process."""
-
     def __init__(self, plan: FleetPlan) -> None:
         self._plan = plan
         self._stack = ExitStack()
@@ -258,7 +256,7 @@ class Fleet:
         return ChunkRobot(load.mode, load, session, blocks, phase_ns, self._done)
 
     def traces(self, start_ns: int) -> list[RobotTrace]:
-        """Return what each robot did so far, as if it had started at ``start_ns``; raises what ended one."""
+        """Return the traces of the robots so far, as if started at ``start_ns``; raises the error that ended one."""
         end_ns, by_ns = now_ns(), start_ns - self._start_ns
         return [robot.trace(number, end_ns).shifted(by_ns) for number, robot in self._robots.items()]
 
@@ -321,7 +319,7 @@ class RemoteFleet:
         """Return a method of that fleet; it raises what that raises, ServerDied if the process has ended."""
         return partial(self._call, name)
 
-    def _call(self, name: str, *given: Any) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         raise NotImplementedError
 
 
@@ -336,15 +334,15 @@ class FleetProcess(RemoteFleet):
         theirs.close()
 
     def close(self) -> None:
-        with suppress(OSError):
+        with suppress(OSError):  # it may have ended
             self._pipe.send(("close", ()))
         self._process.join(2 * PATIENCE_S)
         self._process.kill()
         self._pipe.close()
 
-    def _call(self, name: str, *given: Any) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         try:
-            self._pipe.send((name, given))
+            self._pipe.send((name, arguments))
             reply = self._pipe.recv()
         except (EOFError, OSError) as error:
             raise ServerDied(f"a process of robots (pid {self._process.pid}) died; take fewer robots") from error
@@ -360,9 +358,9 @@ def _serve(plan: FleetPlan, pipe: Connection) -> None:
     fleet, name = Fleet(plan), ""
     with suppress(EOFError, OSError):
         while name != "close":
-            name, given = pipe.recv()
+            name, arguments = pipe.recv()
             try:
-                reply = getattr(fleet, name)(*given)
+                reply = getattr(fleet, name)(*arguments)
             except Exception as error:  # noqa: BLE001 - raised again by the caller
                 reply = error
             pipe.send(reply)
@@ -376,7 +374,7 @@ class FleetOnRay(RemoteFleet):
         self._fleet = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(Fleet).remote(plan)
 
     def machine(self) -> dict[str, Any]:
-        """Return what the process runs on; raises UsageError if no core of the cluster comes free."""
+        """Return the facts of the process's machine; raises UsageError if no core of the cluster comes free."""
         reply = self._fleet.machine.remote()
         if not self._ray.wait([reply], timeout=FREE_CORE_S)[0]:
             raise UsageError(f"`processes`: no core of the cluster came free within {FREE_CORE_S:g} s; take fewer")
@@ -387,8 +385,8 @@ class FleetOnRay(RemoteFleet):
         self._ray.wait([self._fleet.close.remote()], timeout=2 * PATIENCE_S)
         self._ray.kill(self._fleet)
 
-    def _call(self, name: str, *given: Any) -> Any:
-        return self._result(getattr(self._fleet, name).remote(*given))
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return self._result(getattr(self._fleet, name).remote(*arguments))
 
     def _result(self, reference: Any) -> Any:
         errors = self._ray.exceptions

@@ -30,7 +30,7 @@ from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
 
 SEEDS: Final = 5
-"""Of a predicted knee."""
+"""Seeds of a predicted knee."""
 LEVEL: Final = 0.95
 BIASED: Final = (
     "the whole latency of one robot, as the server sends no marks: what is spent beside it counts too, which predicts "
@@ -42,15 +42,15 @@ MOST: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Service:
-    """How long a server takes: times of shape (R, 3), as `ServiceTime`, recorded in order or drawn from a source."""
+    """A server's times of shape (R, 3), as `ServiceTime`, recorded in order or drawn from a source."""
 
     source: Source
     recorded_ns: Ints | None
     mean_ns: float
     servers: int = 1
-    """They share one queue."""
+    """The number of servers, which share one queue."""
     slower: Sequence[float] = (1.0,)
-    """As in `simulate.serve`."""
+    """The factors of `simulate.serve`."""
 
     @staticmethod
     def read(written: str, servers: int = 1, batch: Path | None = None) -> Service:
@@ -76,7 +76,7 @@ class Service:
 
     @property
     def about(self) -> str:
-        """What a service time is."""
+        """The source of the service times, in words."""
         if not self.source.requests:
             return "as given"
         if self.source.requests[0]["server_out_ns"] is None:

@@ -10,7 +10,7 @@ from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics
 from s2a_bench.store.schema import Table
 
 TWIN: Final = ", instant"
-"""After the name of a pipeline: its instant server."""
+"""Suffix of a pipeline's name for its instant server."""
 Source = Literal["measured", "predicted", "twin"]
 Verdict = Literal["below", "above", "undecided", "none"]
 

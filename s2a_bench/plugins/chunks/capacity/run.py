@@ -49,7 +49,7 @@ KEEP_S: Final = 0.2
 """Period in which requests are written while the robots act."""
 HEAD_START_S: Final = 0.2
 LATEST: Final = 0.05
-"""Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
+"""Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is not counted as measured."""
 
 
 def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> Path:
@@ -105,7 +105,7 @@ def _drive(loads: Sequence[RobotLoad], plan: SearchPlan, processes: int, ray: An
 
 @dataclass(slots=True)
 class _Cell:
-    """The fleets of one pipeline and mode."""
+    """The fleets of one pipeline and acting mode."""
 
     load: RobotLoad
     search: SearchPlan
@@ -115,9 +115,9 @@ class _Cell:
     """Opens the robots of a session."""
     session: Session
     instant: Session | None
-    """Of a server that takes no time, with which the generator is checked."""
+    """A session of a server that takes no time, which checks the generator."""
     service: Service | None = None
-    """Of the requests of one robot alone, before any other fleet."""
+    """The service of the requests of one robot alone, before any other fleet."""
     tried: dict[int, Tried] = field(default_factory=dict)
 
     def run(self) -> None:
@@ -136,7 +136,7 @@ class _Cell:
             self._conclude()
 
     def _predict(self) -> None:
-        """Write what one robot's service times predict of the fleets."""
+        """Write the prediction of the fleets from one robot's service times."""
         if self.service is None:
             return
         name, progress = self.load.of(self.session.cell.name), self.launch.progress
@@ -181,7 +181,6 @@ class _Cell:
         return Tried(number, verdict, within, clean)
 
     def _write(self, about: AboutRobot, trace: RobotTrace) -> None:
-        """Write what one robot did, in one episode."""
         settle_ns, writer = self.load.settle_ns, self.launch.writer
         writer.append(ROBOTS, [RobotRow(**vars(about), **vars(measures([trace], self.load.setting, settle_ns)))])
         since_ns = (trace.request_ns - trace.start_ns).tolist()
@@ -196,11 +195,11 @@ class _Cell:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
         tried, name, limit = self.tried.values(), self.load.of(self.session.cell.name), self.search.limit
         driven = max((each.robots for each in tried if each.clean), default=0)
-        if limit is not None and (found := knee(tried)) is not None:
-            row = KneeRow(name, "measured", self.load.limit_text(limit), found.robots, found.low, found.high, driven)
+        if limit is not None and (point := knee(tried)) is not None:
+            row = KneeRow(name, "measured", self.load.limit_text(limit), point.robots, point.low, point.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
-            what = f"{name}: {', '.join(map(str, late))} robots are no measurement: the generator was late or too slow"
+            what = f"{name}: {', '.join(map(str, late))} robots are not measured: the generator was late or too slow"
             advice = "spread the robots with --processes, send smaller pictures (--size), or quiet the machine"
             self.launch.warnings.append(RunWarning("generator-late", what, advice))
 

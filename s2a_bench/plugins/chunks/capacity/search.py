@@ -21,7 +21,7 @@ class Tried:
     within: bool
     """Whether the value itself keeps to the limit, decided or not."""
     clean: bool = True
-    """Whether the generator was in time; if not, it is no measurement."""
+    """Whether the generator was in time; if not, the fleet is not counted as measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def search(numbers: Sequence[int], attempt: Callable[[int], Tried], tried: dict[
 
 
 def knee(tried: Iterable[Tried]) -> Knee | None:
-    """Return what fleets show together, taking a larger fleet to fare no better; None without a measurement."""
+    """Return the knee of fleets, taking a larger fleet to fare no better; None without a measurement."""
     clean = [each for each in tried if each.clean]
     if not clean:
         return None
@@ -107,8 +107,8 @@ class Judge:
                 return "undecided", False
             if self.beyond and first:
                 return ("below", True) if limit.share + share < 1 else ("above", False)
-            known = (self.alone or 0.0) if self.beyond else 0.0
-            low, high, share = low - known, high - known, share - known
+            alone_share = (self.alone or 0.0) if self.beyond else 0.0
+            low, high, share = low - alone_share, high - alone_share, share - alone_share
         else:
             at_ns, robots, above = above_limit(limit, traces, self.settle_ns)
             if not above.size:
@@ -134,15 +134,15 @@ def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> t
             age = trace.ticks.age
             period_ns = (trace.end_ns - trace.start_ns) / max(1, age.size)
             since_ns = (np.arange(age.size) * period_ns).astype(np.int64)
-            known, exceeds = age >= 0, age * period_ns > limit.value
+            counts, exceeds = age >= 0, age * period_ns > limit.value
         else:
             taken_ns = trace.first_ns if limit.column.startswith("ttft") else trace.arrival_ns
             if taken_ns is None:
                 continue
             since_ns, waits_ns = trace.request_ns - trace.start_ns, trace.end_ns - trace.request_ns
             exceeds = np.where(taken_ns < 0, waits_ns, taken_ns) > limit.value
-            known = (taken_ns >= 0) | exceeds
-        kept = known & (since_ns >= settle_ns)
+            counts = (taken_ns >= 0) | exceeds
+        kept = counts & (since_ns >= settle_ns)
         robots = np.full(int(kept.sum()), trace.robot)
         parts.append((trace.start_ns + since_ns[kept], robots, exceeds[kept]))
     if not parts:

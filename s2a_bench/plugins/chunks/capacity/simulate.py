@@ -23,12 +23,10 @@ UNKNOWN: Final = -1
 
 
 class ServiceTime(NamedTuple):
-    """The time of one answer, in ns."""
-
     first_ns: int
-    """From the start of its service to its first piece, or `UNKNOWN`."""
+    """Time from the start of its service to its first piece, or `UNKNOWN`."""
     whole_ns: int
-    """To its last piece; the server is free then."""
+    """Time to its last piece, after which the server is free."""
     beside_ns: int = 0
     """Besides, where no server is occupied."""
 

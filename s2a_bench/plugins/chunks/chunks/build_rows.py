@@ -39,18 +39,18 @@ MOST_POINTS: Final = 64
 """Triggers that are tried."""
 MEANS_TRIED: Final = 33
 REQUESTS_TRIED: Final = 2000
-"""At each mean."""
+"""The number of simulated requests at each mean."""
 SHARES: Final = np.linspace(0, 1, 401)
 """Quantiles of reaction times that are stored: denser than a figure can show."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActedCell:
-    """What a cell did: by its cycles and by its ticks."""
+    """The cycles and the ticks of a cell."""
 
     cell: ActingCell
     setting: ControlSetting
-    """With actions as slow as the cell's."""
+    """The setting, with actions as slow as the cell's."""
     cycles: Cycles
     ticks: Ticks
     more: Mapping[str, Any] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class ActedCell:
 
     @property
     def latency_ns(self) -> Ints:
-        return self.cell.drawn.judged
+        return self.cell.latencies.judged
 
 
 def cell_rows(acted: ActedCell, shown: int, epsilon: float, seed: int) -> dict[Table[Any], Iterable[Any]]:
@@ -75,7 +75,7 @@ def cell_rows(acted: ActedCell, shown: int, epsilon: float, seed: int) -> dict[T
         cell=cell.cell,
         mode=cell.name,
         rule=cell.rule,
-        latency=cell.drawn.source.name,
+        latency=cell.latencies.source.name,
         latency_s=float((latency_ns / 1e9).mean()),
         latency_s_p99=float(np.quantile(latency_ns / 1e9, 0.99)),
         rounding=setting.rounding,
@@ -165,13 +165,13 @@ def _tick_rows(acted: ActedCell, shown: int) -> Iterator[TickRow]:
     late = [None] * ticks.chunk.size if acted.late_ns is None else acted.late_ns.tolist()
     columns = (each[:shown].tolist() for each in (ticks.chunk, ticks.index, ticks.age, ticks.stalled))
     for tick, (chunk, index, age, stalled, late_ns) in enumerate(zip(*columns, late[:shown], strict=True)):
-        known = chunk >= 0
+        acts = chunk >= 0
         yield TickRow(
             cell=acted.cell.cell,
             tick=tick,
-            chunk=chunk if known else None,
-            index=index if known else None,
-            age_ticks=age if known else None,
+            chunk=chunk if acts else None,
+            index=index if acts else None,
+            age_ticks=age if acts else None,
             stalled=stalled,
             late_ns=late_ns,
         )
@@ -198,10 +198,10 @@ def _request_rows(acted: ActedCell, shown: int) -> Iterator[RequestRow]:
         )
 
 
-def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
+def _mean(triggers: tuple[int, ...], trigger: int | None) -> float | None:
     if triggers:
         return float(np.mean(triggers))
-    return None if given is None else float(given)
+    return None if trigger is None else float(trigger)
 
 
 def _blended(cell: ActingCell, cycles: Cycles) -> float | None:
@@ -219,29 +219,28 @@ def _plain(values: Mapping[str, float | None]) -> dict[str, Any]:
     return plain
 
 
-def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Iterator[TriggerRow]:
-    """Yield a row for every trigger of a mode."""
+def trigger_rows(mode: Mode, setting: ControlSetting, latencies: LatencyDraw) -> Iterator[TriggerRow]:
     length = mode.execution_horizon(setting)
     for ticks in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
         tried = mode.varied((ticks,))
-        cycles = tried.cycles(drawn.judged, setting)
+        cycles = tried.cycles(latencies.judged, setting)
         counts = stalls_of(cycles)
         del counts["stalled_cycles"]
         if counts["boundaries"]:
             yield TriggerRow(
-                latency=drawn.source.name,
+                latency=latencies.source.name,
                 mode=without_trigger(mode),
                 execution_horizon=length,
                 trigger=ticks,
                 **counts,
-                p_stall_closed=closed(tried, drawn.judged, setting).p_stall,
+                p_stall_closed=closed(tried, latencies.judged, setting).p_stall,
                 age_ticks_mean=mean_age(cycles),
             )
 
 
-def mean_rows(control: ControlPlan, drawn: LatencyDraw) -> Iterator[MeanRow]:
+def mean_rows(control: ControlPlan, latencies: LatencyDraw) -> Iterator[MeanRow]:
     """Yield a row for each mode under the source's latencies scaled to means from 0 to H ticks."""
-    setting, judged = control.setting, drawn.judged[:REQUESTS_TRIED]
+    setting, judged = control.setting, latencies.judged[:REQUESTS_TRIED]
     shape = judged / max(float(judged.mean()), 1.0)
     for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
         latency_ns = np.rint(shape * mean_ns).astype(np.int64)
@@ -249,7 +248,7 @@ def mean_rows(control: ControlPlan, drawn: LatencyDraw) -> Iterator[MeanRow]:
             cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
             share = measure(mode, cycles, ticks).stall_share
             yield MeanRow(
-                latency=drawn.source.name,
+                latency=latencies.source.name,
                 mode=name,
                 latency_s=mean_ns / 1e9,
                 stall_share=None if np.isnan(share) else share,

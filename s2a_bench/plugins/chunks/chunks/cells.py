@@ -1,4 +1,4 @@
-"""The cells: each mode as given, and the first mode with a trigger once more under each rule."""
+"""The cells: each acting mode as given, and the first one with a trigger once more under each rule."""
 
 from __future__ import annotations
 
@@ -46,20 +46,20 @@ class LatencyDraw:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActingCell:
-    """One mode under one source; ``triggers`` are a rule's, one a request."""
+    """One acting mode under one source; ``triggers`` are a rule's, one a request."""
 
     mode: Mode
     name: str
     """The mode with its parameters, without the trigger if a rule chooses it."""
     rule: str
-    drawn: LatencyDraw
+    latencies: LatencyDraw
     triggers: tuple[int, ...] = ()
     slower: float = 1.0
-    """By how many times slower its actions are executed (time-scaling)."""
+    """Factor by which its actions are executed more slowly (time-scaling)."""
     begin: Callable[[], TriggerRule] | None = None
     """Creates the rule that chooses a trigger after the other; None once all are chosen."""
     calibration: Calibration | None = None
-    """What the rule `calibrated` learned."""
+    """The calibration of the rule `calibrated`."""
 
     @property
     def acting(self) -> Mode:
@@ -70,9 +70,9 @@ class ActingCell:
     @property
     def cell(self) -> str:
         rule = "" if self.rule == GIVEN else f", {self.rule}"
-        return f"{self.name}{rule} @ {self.drawn.source.name}"
+        return f"{self.name}{rule} @ {self.latencies.source.name}"
 
-    def chosen(self, triggers: tuple[int, ...]) -> ActingCell:
+    def with_triggers(self, triggers: tuple[int, ...]) -> ActingCell:
         """Return the cell with the triggers that its rule chose; none: as it is."""
         return replace(self, triggers=triggers, begin=None) if triggers else self
 
@@ -81,7 +81,7 @@ class ActingCell:
         if self.begin is None:
             return self
         most = greatest_trigger(self.mode, setting)
-        return self.chosen(tuple(follow(self.begin(), self.drawn.judged, setting, most).tolist()))
+        return self.with_triggers(tuple(follow(self.begin(), self.latencies.judged, setting, most).tolist()))
 
 
 def draw(source: Source, cycles: int | None, learnt: int, seed: int) -> LatencyDraw:
@@ -94,27 +94,28 @@ def draw(source: Source, cycles: int | None, learnt: int, seed: int) -> LatencyD
     return LatencyDraw(source, source.draw(rng, cycles or CYCLES), source.draw(rules_rng, count))
 
 
-def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterator[ActingCell]:
+def cells(control: ControlPlan, rules: RulesPlan, latencies: LatencyDraw) -> Iterator[ActingCell]:
     """Yield the cells of one source; a live one has no judged latencies yet."""
-    for name, given in control.modes.items():
-        yield ActingCell(given, name, GIVEN, drawn)
+    for name, each in control.modes.items():
+        yield ActingCell(each, name, GIVEN, latencies)
     mode, setting = rules.mode, control.setting
     if mode is None:
         return
     name = without_trigger(mode)
     for rule in rules.tried:
         if rule in {"calibrated", "oracle"}:
-            known = calibrate(drawn.learnt, rules.epsilon, rules.guarantee) if rule == "calibrated" else None
-            limit_ns = known.caution if known else _oracle_ns(drawn.source, rules.epsilon, control.seed)
+            fit = calibrate(latencies.learnt, rules.epsilon, rules.guarantee) if rule == "calibrated" else None
+            limit_ns = fit.caution if fit else _oracle_ns(latencies.source, rules.epsilon, control.seed)
             fixed = trigger(limit_ns, setting, greatest_trigger(mode, setting))
-            yield ActingCell(mode, name, rule, drawn, (fixed.ticks,), min(fixed.beta, rules.slowest), calibration=known)
+            slower = min(fixed.beta, rules.slowest)
+            yield ActingCell(mode, name, rule, latencies, (fixed.ticks,), slower, calibration=fit)
         else:
-            yield ActingCell(mode, name, rule, drawn, begin=partial(_learner, rule, drawn, rules.epsilon))
+            yield ActingCell(mode, name, rule, latencies, begin=partial(_learner, rule, latencies, rules.epsilon))
 
 
-def changes(setting: ControlSetting, name: str, drawn: LatencyDraw) -> list[RunWarning]:
-    """Return whether the delays of judged latencies, in ticks, differ from those that a rule learned from."""
-    learned, seen = (Rows(setting.delay_ticks(each).astype(float)) for each in (drawn.learnt, drawn.judged))
+def changes(setting: ControlSetting, name: str, latencies: LatencyDraw) -> list[RunWarning]:
+    """Return warnings if the delays of judged latencies, in ticks, differ from those that a rule learned from."""
+    learned, seen = (Rows(setting.delay_ticks(each).astype(float)) for each in (latencies.learnt, latencies.judged))
     return change_warnings(name, learned, seen, "control ticks", f"calibrate anew, or {FOLLOW}")
 
 
@@ -122,11 +123,11 @@ def without_trigger(mode: Mode) -> str:
     return canonical(mode.name, mode.varied((0,)))
 
 
-def _learner(rule: str, drawn: LatencyDraw, epsilon: float) -> TriggerRule:
+def _learner(rule: str, latencies: LatencyDraw, epsilon: float) -> TriggerRule:
     if rule == "tracked":
-        return Tracker(drawn.learnt.tolist(), epsilon)
+        return Tracker(latencies.learnt.tolist(), epsilon)
     learner: TriggerRule = Maximum() if rule == "maximum" else Mean()
-    for latency_ns in drawn.learnt.tolist():
+    for latency_ns in latencies.learnt.tolist():
         learner.learn(latency_ns, stalled=False)
     return learner
 

@@ -1,4 +1,4 @@
-"""The options of a run of chunks: modes and rules under given latencies, or live on the answers of a server."""
+"""The options of a run of chunks: acting modes and rules under given latencies, or live on a server's answers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RulesPlan:
     epsilon: float
     guarantee: Guarantee
     slowest: float
-    """By how many times a rule may slow actions down."""
+    """The largest factor by which a rule may slow actions down."""
 
     @property
     def promise(self) -> bool:
@@ -89,7 +89,7 @@ class ChunksOptions(ControlOptions):
 
 
 class ChunksVirtual(ChunksOptions, GivenLatencies):
-    """Modes and rules under given latencies."""
+    """Acting modes and rules under given latencies."""
 
     control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False)
     latency: Sources = option(
@@ -149,7 +149,7 @@ class ChunksVirtual(ChunksOptions, GivenLatencies):
 
 
 class ChunksLive(ChunksOptions, ServedOptions):
-    """Modes and rules in real time, on the answers of a server."""
+    """Acting modes and rules in real time, on the answers of a server."""
 
     seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
     robot: str = option(

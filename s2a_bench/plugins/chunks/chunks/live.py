@@ -1,4 +1,4 @@
-"""The live run: every mode acts at control rate on a server's answers; the metrics are those of virtual time.
+"""The live run: every acting mode runs at control rate on a server's answers; the metrics are those of virtual time.
 
 A latency counts from the start of the tick of a request until its chunk is complete.
 """
@@ -34,7 +34,7 @@ from s2a_bench.progress import Progress
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveResult:
-    """The actions of a mode over a pipeline; ``triggers`` are those that its rule chose."""
+    """The actions of an acting mode over a pipeline; ``triggers`` are those that its rule chose."""
 
     cell: ActingCell
     setting: ControlSetting
@@ -57,7 +57,7 @@ class LiveResult:
         arrival_ns, ticks = self.acted.arrival_ns, self.acted.chunk.size
         end_ns = ticks * self.setting.period_ns
         arrival_ns = np.where((arrival_ns < 0) | (arrival_ns > end_ns), end_ns, arrival_ns)
-        cycles = self.cell.chosen(self.triggers).acting.arrays(arrival_ns, self.setting)
+        cycles = self.cell.with_triggers(self.triggers).acting.arrays(arrival_ns, self.setting)
         if cycles is None:
             return None
         computed = lay(cycles)
@@ -79,7 +79,7 @@ class LiveResult:
         }
 
     def actions(self) -> ActedCell:
-        """Return what the cell did, with the latencies of complete answers, to their first action.
+        """Return the actions of the cell, with the latencies of complete answers, to their first action.
 
         Raises TransportError for fewer than two chunks.
         """
@@ -87,7 +87,7 @@ class LiveResult:
         if latency_ns.size < 2:  # noqa: PLR2004 - a boundary lies between two chunks
             seconds = self.acted.chunk.size * self.setting.period_ns / 1e9
             raise TransportError(f"{self.cell.cell}: {latency_ns.size} chunks in {seconds:g} s; act for longer")
-        judged = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
+        judged = replace(self.cell, latencies=replace(self.cell.latencies, judged=latency_ns))
         cycles, ticks = self.counted()
         more: dict[str, Any] = {"agreement": self.agreement(ticks), **self.timing()}
         if ticks.stalled.any() and ticks.stalled[-1]:  # the run ends while it waits at a boundary
@@ -95,7 +95,7 @@ class LiveResult:
             more |= stall_metrics(stalls["stalled_cycles"] + 1, stalls["boundaries"] + 1)
         if self.cell.mode.streams:  # the closed forms are about a given gap between actions
             more |= dict.fromkeys(("p_stall_closed", "reaction_s_closed", "margin_ticks"))
-        judged = judged.chosen(self.triggers[: latency_ns.size])
+        judged = judged.with_triggers(self.triggers[: latency_ns.size])
         return ActedCell(judged, self.setting, cycles, ticks, more, self.acted.late_ns, self.requester.names)
 
 
@@ -121,9 +121,9 @@ def _drive(config: ChunksLive, launch: RunningLaunch) -> None:
     for name, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
         sessions = list(of_cell)
         learnt, dims = warm_up(control.setting, launch, sessions, blocks)
-        drawn = LatencyDraw(Source(f"{name}, {config.latency}" if config.latency else name), learnt[:0], learnt)
-        tried += [(cell, sessions, dims) for cell in cells(control, rules, drawn)]
-    calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
+        latencies = LatencyDraw(Source(f"{name}, {config.latency}" if config.latency else name), learnt[:0], learnt)
+        tried += [(cell, sessions, dims) for cell in cells(control, rules, latencies)]
+    calibrations = {cell.latencies.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
     launch.writer.update(calibrations=calibrations)
     launch.warnings.extend(exchange_warnings(calibrations, FOLLOW))
     launch.progress.expect(len(tried))
@@ -141,8 +141,8 @@ def _drive(config: ChunksLive, launch: RunningLaunch) -> None:
             whole = acted.ticks.chunk.size  # what is measured is kept
             for table, rows in cell_rows(acted, whole, rules.epsilon, control.seed).items():
                 launch.writer.append(table, rows)
-        if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, acted.cell.drawn)):
+        if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, acted.cell.latencies)):
             launch.warnings.extend(changed)
             if cell.calibration:
-                launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
+                launch.writer.update(calibrations={cell.latencies.source.name: {"changed": True}})
         launch.progress.advance()

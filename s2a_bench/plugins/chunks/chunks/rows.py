@@ -18,7 +18,7 @@ _ticks = partial(mean, unit="ticks")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkRow:
-    """A mode and rule under a source of latencies."""
+    """An acting mode and a rule under a source of latencies."""
 
     cell: str
     mode: Annotated[str, about("With the parameters that are not at their defaults.")]

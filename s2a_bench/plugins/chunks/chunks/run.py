@@ -1,4 +1,4 @@
-"""The run of chunks in virtual time: modes and rules under the same latencies, varied triggers and mean latencies."""
+"""The run of chunks in virtual time: acting modes and rules under the same latencies, varied triggers and means."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ MOST_TICKS: Final = 100_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualPlan:
-    """What is drawn for a run in virtual time, and what follows."""
+    """The draws of a run in virtual time, and the values derived from them."""
 
-    drawn: Sequence[LatencyDraw]
-    """Of each source."""
+    latencies: Sequence[LatencyDraw]
+    """The draws of each source."""
     cells: Sequence[ActingCell]
     manifest: dict[str, Any]
 
@@ -38,16 +38,16 @@ class VirtualPlan:
 def resolve(config: ChunksVirtual) -> VirtualPlan:
     """Draw the latencies, have the rules learn, and decide what follows; raises S2AError."""
     control, rules, setting = config.control, config.rules_plan, config.setting
-    drawn = [draw(source, config.cycles, config.learnt, config.seed) for source in config.sources]
-    for each in drawn:
+    latencies = [draw(source, config.cycles, config.learnt, config.seed) for source in config.sources]
+    for each in latencies:
         _check_memory(each, setting)
-    tried = [cell.followed(setting) for each in drawn for cell in cells(control, rules, each)]
-    calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell in tried if cell.calibration}
+    tried = [cell.followed(setting) for each in latencies for cell in cells(control, rules, each)]
+    calibrations = {cell.latencies.source.name: asdict(cell.calibration) for cell in tried if cell.calibration}
     warnings = exchange_warnings(calibrations, FOLLOW)
     if config.learnt and (missing := ", ".join(rule for rule in config.rules if rule not in rules.tried)):
         few = f"without the rules {missing}: {config.too_few}"
         warnings = [RunWarning("few-latencies", few, "record more, or raise --eps"), *warnings]
-    for each in {cell.drawn.source.name: cell.drawn for cell in tried if cell.rule in PROMISING}.values():
+    for each in {cell.latencies.source.name: cell.latencies for cell in tried if cell.rule in PROMISING}.values():
         name, recorded = each.source.name, each.source.recorded_ns is not None
         if recorded and (changed := changes(setting, name, each)):
             warnings += changed
@@ -59,39 +59,39 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
         "calibrations": calibrations,
         "warnings": warnings,
         "provenance": Origins(
-            Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
+            Provenance.computed(), {cell.cell: cell.latencies.source.provenance for cell in tried}
         ).to_manifest(),
     }
-    return VirtualPlan(drawn, tried, manifest)
+    return VirtualPlan(latencies, tried, manifest)
 
 
-def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
+def _check_memory(latencies: LatencyDraw, setting: ControlSetting) -> None:
     """Raise UsageError for latencies of more ticks than are held in memory."""
-    ticks = int(drawn.judged.size) * setting.horizon + int(setting.known_ticks(drawn.judged).sum())
+    ticks = int(latencies.judged.size) * setting.horizon + int(setting.known_ticks(latencies.judged).sum())
     if ticks > MOST_TICKS:
         raise UsageError(
-            f"`cycles`: {drawn.judged.size} chunks @ {drawn.source.name} make {ticks:.2g} control ticks, more than "
-            f"{MOST_TICKS:.0e}; take fewer, or a lower `control_hz`"
+            f"`cycles`: {latencies.judged.size} chunks @ {latencies.source.name} make {ticks:.2g} control ticks, more "
+            f"than {MOST_TICKS:.0e}; take fewer, or a lower `control_hz`"
         )
 
 
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
     """Act in virtual time and return the run folder; raises S2AError."""
     plan = resolve(config)
-    setting, mode, first = config.control.setting, config.rules_plan.mode, plan.drawn[0]
+    setting, mode, first = config.control.setting, config.rules_plan.mode, plan.latencies[0]
     with RunWriter.create(output, "chunks", plan.manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
         progress.expect(len(plan.cells))
         for cell in plan.cells:
-            acting, latency_ns, slowed = cell.acting, cell.drawn.judged, setting.slowed(cell.slower)
+            acting, latency_ns, slowed = cell.acting, cell.latencies.judged, setting.slowed(cell.slower)
             acted = ActedCell(cell, slowed, acting.cycles(latency_ns, slowed), acting.ticks(latency_ns, slowed))
             for table, rows in cell_rows(acted, config.shown_ticks, config.epsilon, config.seed).items():
                 writer.append(table, rows)
             progress.advance()
         if mode is not None:
-            for drawn in plan.drawn:
-                writer.append(TRIGGERS, trigger_rows(mode, setting, drawn))
+            for latencies in plan.latencies:
+                writer.append(TRIGGERS, trigger_rows(mode, setting, latencies))
         writer.append(MEANS, mean_rows(config.control, first))
         if config.export_delays is not None:
             write_delays(config.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))

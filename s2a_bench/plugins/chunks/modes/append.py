@@ -121,7 +121,7 @@ class Streamed(Appending):
         usable, known = setting.delay_ticks(arrival_ns[:, :length]), setting.known_ticks(arrival_ns[:, length - 1])
         ready = usable[:, 0] + self.hold_ticks(setting)
         if (usable - np.arange(length) > ready[:, np.newaxis]).any():
-            return None  # an action arrives after its turn: the chunk is no single run
+            return None  # an action arrives after its turn: the chunk is not a single run
         if self.trigger >= length and (ready > known).any():
             return None  # the next request leaves while the chunk is held back
         return _append(usable[:, 0], ready, known, (self.trigger,), length, setting.horizon)

@@ -110,8 +110,8 @@ def follow(rule: TriggerRule, latency_ns: Ints, setting: ControlSetting, most: i
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen(Mode):
-    """Another mode with a trigger chosen request by request."""
+class VaryingTrigger(Mode):
+    """Another acting mode, whose trigger is chosen anew for each request."""
 
     mode: Mode
 
@@ -133,7 +133,7 @@ class Chosen(Mode):
 
 
 @dataclass(slots=True)
-class ChosenStepper(ChunkStepper):
+class TriggerStepper(ChunkStepper):
     """Sets a stepper's trigger before each `ask`."""
 
     stepper: ChunkStepper
@@ -158,7 +158,7 @@ class ChosenStepper(ChunkStepper):
 
 
 @dataclass(frozen=True, slots=True)
-class Varied(Chosen):
+class Varied(VaryingTrigger):
     """Request chunk r when ``triggers[r]`` actions are left; the last trigger applies to all later requests."""
 
     triggers: tuple[int, ...]
@@ -167,12 +167,12 @@ class Varied(Chosen):
         def choose() -> int:
             return self.triggers[min(len(stepper.triggers), len(self.triggers) - 1)]
 
-        stepper = ChosenStepper(self.mode.stepper(setting), choose)
+        stepper = TriggerStepper(self.mode.stepper(setting), choose)
         return stepper
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Learning(Chosen):
+class Learning(VaryingTrigger):
     """Choose each trigger by a rule, which ``begin`` makes: `follow` on a live robot.
 
     The robot measures whole ticks. The rule learns the middle of the latencies that give a delay of d ticks, which is
@@ -192,7 +192,7 @@ class Learning(Chosen):
 
 
 @dataclass(slots=True, kw_only=True)
-class LearningStepper(ChosenStepper):
+class LearningStepper(TriggerStepper):
     """A stepper whose rule learns from the delay of every answer."""
 
     rule: TriggerRule
@@ -203,7 +203,7 @@ class LearningStepper(ChosenStepper):
     """Requests with a known delay."""
 
     def arrived(self, request: int, actions: int, tick: int) -> None:
-        ChosenStepper.arrived(self, request, actions, tick)
+        TriggerStepper.arrived(self, request, actions, tick)  # `super()` does not know a class made anew for its slots
         if self.learnt <= request == len(self.triggers) - 1 and actions >= self.length:
             self.learnt = request + 1
             delay = tick - self.request_tick

@@ -1,4 +1,4 @@
-"""What delay costs a task: success against latency, in virtual time or live."""
+"""The experiment ``task``: success against latency, in virtual time or live."""
 
 from s2a_bench.experiments import Experiment, RunMode
 

@@ -26,7 +26,7 @@ MOST_STEPS = 1_000_000
 
 
 class TaskOptions(ControlOptions):
-    """A robot with a task, in modes of acting."""
+    """A robot with a task, under acting modes."""
 
     robot: str = option(
         ..., "robot with a world, as gym?env=CartPole-v1&success=survival", first=True, names=lambda: ROBOTS
@@ -67,7 +67,7 @@ class TaskOptions(ControlOptions):
 
 
 class TaskVirtual(TaskOptions, GivenLatencies):
-    """Modes under given latencies; the policy is asked in this process."""
+    """Acting modes under given latencies; the policy is asked in this process."""
 
     engine: EngineConfig = group(EngineConfig, only=("name", "action_dim"))
     prompt: str = option(DEFAULT_TASK, "the task in words")
@@ -92,6 +92,6 @@ class TaskVirtual(TaskOptions, GivenLatencies):
 
 
 class TaskLive(TaskOptions, ServedOptions):
-    """Modes in real time, on the answers of a server."""
+    """Acting modes in real time, on the answers of a server."""
 
     requests: LoopRequests = group(LoopRequests, only=(*GROUPED, *AROUND, "prompt"), first=("transports",))

@@ -49,15 +49,15 @@ def episode_row(
 ) -> EpisodeRow:
     """Return the row of an episode; ``names`` are its cell, mode and latency."""
     latency_ns = acted.arrival_ns[: acted.whole, -1]
-    chosen = acted.chunk >= 0
-    age = chosen.nonzero()[0] - acted.request_tick[acted.chunk[chosen]]
+    acted_on = acted.chunk >= 0
+    age = acted_on.nonzero()[0] - acted.request_tick[acted.chunk[acted_on]]
     return EpisodeRow(
         **names,
         seed=seed,
         latency_s=float(latency_ns.mean() / 1e9) if latency_ns.size else None,
         duration_s=acted.chunk.size * period_ns / 1e9,
         ticks=int(acted.chunk.size),
-        stall_ticks=int((~chosen[chosen.argmax() :]).sum()) if chosen.any() else 0,
+        stall_ticks=int((~acted_on[acted_on.argmax() :]).sum()) if acted_on.any() else 0,
         age_ticks=float(age.mean()) if age.size else None,
         **asdict(outcome),
         slower=float(acted.busy_ns.mean() / period_ns) if live else None,
@@ -114,8 +114,8 @@ def task_cells(episodes: Cells[EpisodeRow]) -> list[TaskCell]:
     cells = episodes.split()
     ends: dict[str, Any] = {name: each.frame.set_index("seed")["success"].to_dict() for name, each in cells.items()}
     without = {each.first.mode: name for name, each in cells.items() if fixed_s(each.first.latency) == 0}
-    found = [_cell(name, each, ends, without.get(each.first.mode, "")) for name, each in cells.items()]
-    return sorted(found, key=lambda cell: (cell.mode, cell.latency_s or 0.0))
+    rows = [_cell(name, each, ends, without.get(each.first.mode, "")) for name, each in cells.items()]
+    return sorted(rows, key=lambda cell: (cell.mode, cell.latency_s or 0.0))
 
 
 def _cell(name: str, episodes: Cells[EpisodeRow], ends: Mapping[str, Mapping[int, bool]], without: str) -> TaskCell:

@@ -52,7 +52,7 @@ class TaskCase:
     source: Source
     steps: int
     seed: int
-    """Of what is drawn besides the episodes' own seeds."""
+    """The seed of all draws beside the episodes' own."""
 
     @property
     def cell(self) -> str:

@@ -1,4 +1,4 @@
-"""For the tests of packages that add a mode of acting on chunks: `mode.ModeSuite`."""
+"""The test suite for packages that add a mode of acting on chunks: `mode.ModeSuite`."""
 
 import pytest
 

@@ -25,7 +25,7 @@ def draw(seed: int, horizon: int, requests: int, longest: float, *, floor: bool)
     return np.where(whole, latency_ns // setting.period_ns * setting.period_ns, latency_ns), setting
 
 
-drawn = st.builds(
+cases = st.builds(
     draw,
     seed=st.integers(0, 2**32 - 1),
     horizon=st.integers(8, 20),
@@ -42,7 +42,7 @@ class ModeSuite:
         assert mode.name in MODES
 
     @shared
-    @given(case=drawn)
+    @given(case=cases)
     def test_the_stepper_and_the_arrays_agree(self, mode: Mode, case: Case) -> None:
         arrays: tuple[Any, ...] = mode.cycles(*case), mode.ticks(*case)
         for array, stepped in zip(arrays, step(mode, *case), strict=True):
@@ -50,7 +50,7 @@ class ModeSuite:
                 np.testing.assert_array_equal(getattr(array, field.name), getattr(stepped, field.name), field.name)
 
     @shared
-    @given(case=drawn)
+    @given(case=cases)
     def test_its_pace_is_when_it_asks(self, mode: Mode, case: Case) -> None:
         latency_ns, setting = case
         if (pace := mode.pace(setting)) is not None:
@@ -60,7 +60,7 @@ class ModeSuite:
             assert ticks == [*cycles.request_tick, cycles.ticks]
 
     @shared
-    @given(case=drawn)
+    @given(case=cases)
     def test_it_asks_at_once_and_then_at_most_once_a_tick(self, mode: Mode, case: Case) -> None:
         request_tick = mode.cycles(*case).request_tick
         assert request_tick.size == case[0].size
@@ -68,7 +68,7 @@ class ModeSuite:
         assert (np.diff(request_tick) > 0).all()
 
     @shared
-    @given(case=drawn)
+    @given(case=cases)
     def test_no_action_is_executed_before_it_has_arrived(self, mode: Mode, case: Case) -> None:
         latency_ns, setting = case
         cycles, ticks = mode.cycles(*case), mode.ticks(*case)
@@ -78,7 +78,7 @@ class ModeSuite:
         assert (acted >= usable).all()
 
     @shared
-    @given(case=drawn)
+    @given(case=cases)
     def test_chunks_follow_one_another_and_so_do_their_actions(self, mode: Mode, case: Case) -> None:
         ticks = mode.ticks(*case)
         chunk, index = (each[ticks.chunk >= 0] for each in (ticks.chunk, ticks.index))
@@ -88,7 +88,7 @@ class ModeSuite:
         assert (index < case[1].horizon).all()
 
     @shared
-    @given(case=drawn)
+    @given(case=cases)
     def test_what_it_does_hangs_on_no_later_latency(self, mode: Mode, case: Case) -> None:
         latency_ns, setting = case
         whole = mode.ticks(latency_ns, setting)

@@ -105,10 +105,10 @@ class Check:
 
     def verdict(self, values: Sequence[Ratio]) -> str:
         """Judge measured values; one without an interval is undecided."""
-        known = ((value.low, value.high) for value in values)
+        bounds = ((value.low, value.high) for value in values)
         intervals = [
             (-inf, inf) if low is None or high is None else (low - self.margin, high + self.margin)
-            for low, high in known
+            for low, high in bounds
         ]
         verdicts = [within(low, high, self.least, self.most) for low, high in intervals]
         if self.of == "each":

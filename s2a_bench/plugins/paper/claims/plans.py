@@ -70,11 +70,11 @@ class _Or(Need):
 
 
 def _unlike(settings: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    chosen = {name: settings.get(name, UNKNOWN) for name in wanted}
-    return ", ".join(f"{name} {chosen[name]}" for name in wanted if chosen[name] != wanted[name]) or AS_CHOSEN
+    values = {name: settings.get(name, UNKNOWN) for name in wanted}
+    return ", ".join(f"{name} {values[name]}" for name in wanted if values[name] != wanted[name]) or AS_CHOSEN
 
 
-def _chosen(wanted: Mapping[str, Any], *more: str) -> Need:
+def _chosen_settings(wanted: Mapping[str, Any], *more: str) -> Need:
     listed = ", ".join((*(f"{key} {value}" for key, value in wanted.items()), *more))
     return Need("settings", f"{listed}: chosen, as the paper gives none", AS_CHOSEN.__eq__, chosen=True)
 
@@ -128,7 +128,7 @@ def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[Plans]:
     return plans
 
 
-SETTINGS: Final = _chosen(PLANS, f"jitter none or {NAMED_JITTER}")
+SETTINGS: Final = _chosen_settings(PLANS, f"jitter none or {NAMED_JITTER}")
 EVEN, UNEVEN = one_of("times", EXACT), one_of("times", VARYING)
 SEVERAL: Final = Need("L", "two or more", lambda fact: ", " in fact), more("stall of naive in s", TOLERANCE_S)
 WAITS: Final = more("S0 after the first arrival in s", TOLERANCE_S)
@@ -247,7 +247,7 @@ def plane(run: StoredRun) -> Iterator[RunPart]:
 
 
 EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda fact: fact == "evenly")
-OF_THE_PLANE: Final = _chosen(PLANE)
+OF_THE_PLANE: Final = _chosen_settings(PLANE)
 
 
 def stalls_at(side: str, part: RunPart) -> tuple[list[Ratio], str]:

@@ -48,8 +48,8 @@ def one_of(name: str, *values: str) -> Need:
 def on_board(board: str) -> Need:
     """Return the need for a board of that name; with "super" or "laptop" after it, it is another one."""
     name = re.escape(board.removeprefix("Jetson "))
-    known = re.compile(rf"(?<!\S){name}(?![^\s,])(?! (?:super|laptop)\b)", re.IGNORECASE)
-    return Need("board", board, lambda fact: bool(known.search(fact)))
+    pattern = re.compile(rf"(?<!\S){name}(?![^\s,])(?! (?:super|laptop)\b)", re.IGNORECASE)
+    return Need("board", board, lambda fact: bool(pattern.search(fact)))
 
 
 PAPERS_MODEL: Final = (

@@ -92,7 +92,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
         fields = {"timestamp": stamp, "timestep": self._timestep, "observation": observation, "must_go": True}
         body = memoryview(pickled("TimedObservation", fields))
         starts = range(0, len(body), PIECE_BYTES)
-        states = [BEGIN, *[MIDDLE] * (len(starts) - 2), END][-len(starts) :]
+        states = [BEGIN, *[MIDDLE] * (len(starts) - 2), END][-len(starts) :]  # a single piece is END alone
         pieces = [
             bytes((8, state)) + message_of(body[start : start + PIECE_BYTES], 2)
             for state, start in zip(states, starts, strict=True)
@@ -127,7 +127,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
             return RequestFailed(f"{self._url} broke the connection: {why}")
         meaning = {
             grpc.StatusCode.DEADLINE_EXCEEDED: f"was silent for too long: {self._wiring.timeout_s:g} s",
-            grpc.StatusCode.UNIMPLEMENTED: f"is no policy server of lerobot's: {why}",
+            grpc.StatusCode.UNIMPLEMENTED: f"is not a policy server of lerobot's: {why}",
             grpc.StatusCode.RESOURCE_EXHAUSTED: f"answered with more than 4 MiB (see `actions_per_chunk`): {why}",
         }.get(code, f"refused ({code.name}): {why}")
         return RequestFailed(f"{self._url} {meaning}", starting=code is grpc.StatusCode.DEADLINE_EXCEEDED)
@@ -140,7 +140,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Yield what holds for every server of lerobot's; no method is called, as `Ready` would reset it."""
+    """Yield the findings that hold for every server of lerobot's; no method is called, as `Ready` would reset it."""
     yield from connect(parts)
     what = "lerobot's policy server answers no sooner than 33 ms after a request, unless it was started otherwise"
     yield Finding("sleep", "advice", what, "start it with --inference_latency=0; runs warn of it (padded-answers)")
@@ -163,5 +163,5 @@ def bytes_in(message: bytes) -> bytes:
     start = next((at + 1 for at, byte in enumerate(message[1:7], 1) if byte < MORE), 0)
     data = message[start:]
     if message_of(data) != message:
-        raise RequestFailed(f"{len(message)} bytes that are no message of lerobot's")
+        raise RequestFailed(f"{len(message)} bytes that are not a message of lerobot's")
     return data

@@ -28,7 +28,7 @@ Names: TypeAlias = Mapping[tuple[str, str], Any]
 
 HELPERS: Final = "lerobot.async_inference.helpers"
 OPCODES: Final = 20_000
-"""Most opcodes of a pickle; an action has 40, and a dictionary's key of so many tuples in each other is no danger."""
+"""Most opcodes of a pickle; an action has 40, and a dictionary's key of so many nested tuples is harmless."""
 NEEDED: Final = frozenset(
     {
         *("PROTO", "FRAME", "STOP", "MARK", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1"),
@@ -69,7 +69,7 @@ def chunk_in(data: bytes) -> tuple[float, Numbers]:
         return float(actions[0].timestamp), np.stack(rows)
     except Exception as error:
         why = str(error)[:SHOWN] or type(error).__name__
-        raise RequestFailed(f"{len(data)} bytes that are no chunk of lerobot's: {why}") from error
+        raise RequestFailed(f"{len(data)} bytes that are not a chunk of lerobot's: {why}") from error
 
 
 def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -92,14 +92,14 @@ def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any
             observation[key] = value
         else:
             raise UsageError(
-                f"`template` {template}: {key} is no picture (H, W, 3), no state (D,) and no text, which lerobot takes"
+                f"`template` {template}: {key} must be a picture (H, W, 3), a state (D,) or a text for lerobot"
             )
     features["observation.state"] = {"dtype": "float32", "shape": (len(motors),), "names": [*motors]}
     return observation | motors, features
 
 
 def _names() -> Names:
-    """Return what the names of one answer stand for, made for it alone: a pickle can set their attributes."""
+    """Return the meaning of an answer's names, made anew for each answer: a pickle can set their attributes."""
     storages: dict[bytes, Numbers] = {}
 
     class TimedAction(SimpleNamespace):
@@ -131,8 +131,8 @@ def _storage(data: bytes) -> Numbers:
     file = BytesIO(data)
     *head, system, storage, _ = (_load(file, STORAGES) for _ in range(5))
     kind, dtype, _, _, count, view = storage
-    known = kind == "storage" and dtype in STORAGES.values() and view is None
-    if tuple(head) != HEAD or not system["little_endian"] or not known:
+    is_storage = kind == "storage" and dtype in STORAGES.values() and view is None
+    if tuple(head) != HEAD or not system["little_endian"] or not is_storage:
         raise ValueError("a storage that is not torch's, is big-endian, or of no type of an action")
     count_field, numbers = file.read(COUNT.itemsize), np.frombuffer(file.read(), dtype)
     if count_field != count.to_bytes(COUNT.itemsize, "little") or len(numbers) != count:

@@ -5,7 +5,7 @@ A call is one exchange, from the first DATA byte of its request (headers may go 
 lerobot's `SendObservations` and `GetActions` are one exchange, from an observation to its chunk. Its robot sends more
 observations while it waits, most of which the server drops. A chunk belongs to the observation made at the time stamp
 of its first action, whose eight bytes stand at the head of that observation's pickle; if none has them, to the newest
-one that was sent whole. Older ones were dropped, and an answer without a chunk is no exchange. Observations are not
+one that was sent whole. Older ones were dropped, and an answer without a chunk is not an exchange. Observations are not
 decoded, as they are pickles.
 """
 
@@ -31,7 +31,7 @@ from s2a_bench.transport.tap import LETTERS, MOST_WAITING, Incoming, ParsedTapRe
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 SEND, GET = f"grpc {SERVICE}SendObservations", f"grpc {SERVICE}GetActions"
 HEADERS_BYTES: Final = 1 << 16
-"""Of a block of headers, and of hpack's table, whatever the peers agreed on."""
+"""The most bytes of a block of headers, and of hpack's table, whatever the peers agreed on."""
 PREFIX: Final = 5
 """Bytes before each message: whether it is compressed, and its size."""
 HEAD: Final = 512
@@ -39,7 +39,7 @@ HEAD: Final = 512
 CHUNK_BYTES: Final = 4 << 20
 """gRPC's own limit of a message."""
 OBSERVATIONS: Final = 100
-"""That wait for a chunk."""
+"""The most observations that wait for a chunk."""
 ERRORS: Final = {str(code.value[0]).encode(): f"gRPC {code.name}" for code in grpc.StatusCode} | {b"0": ""}
 
 
@@ -72,14 +72,14 @@ class SeenCall:
 
 
 class GrpcReader(ParsedTapReader):
-    def __init__(self, report: Callable[[Seen], None], known: set[str]) -> None:
-        super().__init__(report, known)
+    def __init__(self, report: Callable[[Seen], None], kinds: set[str]) -> None:
+        super().__init__(report, kinds)
         self._calls: dict[int, SeenCall] = {}
         self._observations = deque[SeenCall](maxlen=OBSERVATIONS)
 
     def messages(self, incoming: Incoming, *, up: bool) -> Generator[None, None, None]:
         if up and (yield from incoming.read(len(PREFACE))) != PREFACE:
-            raise ValueError("no HTTP/2")
+            raise ValueError("not HTTP/2")
         decoder = Decoder(HEADERS_BYTES)
         decoder.max_allowed_table_size = HEADERS_BYTES
         while True:
@@ -121,7 +121,7 @@ class GrpcReader(ParsedTapReader):
         if call is None:
             return
         call.seen.error = error
-        if len(call.seen.pieces_ns) == 1:
+        if len(call.seen.pieces_ns) == 1:  # an answer in one message is not a stream
             call.seen.pieces_ns.clear()
         if call.seen.what == GET and (error or call.seen.down_bytes > PREFIX):
             self._got(call)
@@ -132,7 +132,7 @@ class GrpcReader(ParsedTapReader):
             self.report(call.seen)
 
     def _got(self, call: SeenCall) -> None:
-        """Tell of an observation with its chunk, or the error in place of one."""
+        """Report an observation with its chunk, or the error in place of one."""
         its = [each for each in self._observations if each.whole][-1:]
         with suppress(RequestFailed):
             stamp, actions = chunk_in(bytes_in(call.chunk))

@@ -52,5 +52,5 @@ class Websocket(ListeningTransport[WebsocketOptions], PolicyTransport[WebsocketO
 
 
 STREAM_PATH = "/stream"
-"""Where our server answers with partial and final frames; anywhere else with whole chunks."""
+"""The path at which our server answers with partial and final frames; at any other with whole chunks."""
 WEBSOCKET = Websocket()

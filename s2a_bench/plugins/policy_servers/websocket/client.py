@@ -25,7 +25,7 @@ from s2a_bench.plugins.policy_servers.observation import CAMERAS, EXTENSION, Ext
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient, policy_picture
 from s2a_bench.plugins.policy_servers.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
-from s2a_bench.plugins.policy_servers.websocket.link import Broken, Link
+from s2a_bench.plugins.policy_servers.websocket.link import Broken, Connection
 from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
@@ -50,14 +50,14 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         key = read_key(wiring.options.api_key_env)
         self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
         self._headers[codec.MARKS_HEADER] = "1"
-        self._link: Link | None = None
+        self._connection: Connection | None = None
         self._metadata: dict[str, str] = {}
         self._ignored: list[tuple[int, str]] = []
         self._provenance: dict[str, str] = {}
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
         try:
-            if self._template.unnamed and not self._native and self._link is None:
+            if self._template.unnamed and not self._native and self._connection is None:
                 self._connected(bounds)
                 trace.mark("connect")
             body = self._pack(request, trace)
@@ -90,42 +90,42 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
 
     def _sent(self, body: bytes, cameras: int, bounds: Bounds, trace: Trace) -> bytes:
         """Send, once more if the server had just closed the kept connection; return the answer's first message."""
-        if self._link is not None:
-            if self._link.alive(bounds):
+        if self._connection is not None:
+            if self._connection.alive(bounds):
                 with suppress(Broken):
-                    return self._exchanged(self._link, body, cameras)
+                    return self._exchanged(self._connection, body, cameras)
             trace.facts[RECONNECTS] = 1.0
             self._abandon()
-        link = self._connected(bounds)
+        connection = self._connected(bounds)
         trace.mark("connect")
-        return self._exchanged(link, body, cameras)
+        return self._exchanged(connection, body, cameras)
 
-    def _connected(self, bounds: Bounds) -> Link:
-        self._link = None
-        link = Link(self._url, self._headers, bounds, self._wiring.timeout_s, self._server.idle_s)
+    def _connected(self, bounds: Bounds) -> Connection:
+        self._connection = None
+        connection = Connection(self._url, self._headers, bounds, self._wiring.timeout_s, self._server.idle_s)
         try:
             if self._server.greets:
-                self._greeted(link)
+                self._greeted(connection)
             if self._server.reset is not None:
-                link.send(packb(self._server.reset))
-                self._ready(link.receive())
+                connection.send(packb(self._server.reset))
+                self._ready(connection.receive())
         except BaseException:
-            link.abandon()
+            connection.abandon()
             raise
-        self._link = link
-        return link
+        self._connection = connection
+        return connection
 
-    def _exchanged(self, link: Link, body: bytes, cameras: int) -> bytes:
+    def _exchanged(self, connection: Connection, body: bytes, cameras: int) -> bytes:
         for index, path in self._ignored:
             if index < cameras:
-                known, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
+                keys, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
                 name = self._template.name
-                raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
-        link.send(body)
-        return self._message(link)
+                raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {keys}; {cure}")
+        connection.send(body)
+        return self._message(connection)
 
-    def _greeted(self, link: Link) -> None:
-        metadata = unpackb(self._message(link))
+    def _greeted(self, connection: Connection) -> None:
+        metadata = unpackb(self._message(connection))
         if not isinstance(metadata, dict):
             raise RequestFailed(f"{self._url}: its metadata is {type(metadata).__name__}, not a dictionary")
         origin = metadata.get("provenance")
@@ -147,9 +147,9 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         elif answer.lstrip().startswith("Traceback"):
             raise self._failed(answer)
 
-    def _message(self, link: Link) -> bytes:
+    def _message(self, connection: Connection) -> bytes:
         """Return the next binary message; a text is an error."""
-        message = link.receive()
+        message = connection.receive()
         if isinstance(message, str):
             raise self._failed(message)
         return message
@@ -165,7 +165,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
 
     def _actions(self, message: bytes, trace: Trace) -> Iterator[Action]:
         """Yield the actions of an answer; after the last, complete the trace."""
-        assert self._link  # noqa: S101 - for mypy
+        assert self._connection  # noqa: S101 - for mypy
         count, first_ns = 0, 0
         while True:
             answer = unpackb(message)
@@ -183,12 +183,12 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             count += len(actions)
             if last:
                 break
-            message = self._message(self._link)
+            message = self._message(self._connection)
         if isinstance(answer, dict) and isinstance(timing := answer.get(codec.TIMING), dict):
             plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in timing.items()}
             trace.learn({fact: plain[name] for name, fact in TIMING.items() if name in plain})
         if self._native:
-            trace.receive(observed.remote_of(unpackb(self._message(self._link))))
+            trace.receive(observed.remote_of(unpackb(self._message(self._connection))))
         infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)
         if trace.remote is not None:
             trace.marks.append(("return", first_ns))
@@ -199,18 +199,18 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
 
     def describe(self) -> dict[str, str]:
         """Return the server and its metadata, for the manifest; connects to a foreign server."""
-        if not self._native and self._link is None:
+        if not self._native and self._connection is None:
             self._connected(self._wiring.bounds(self._url, 1))
         return {**super().describe(), **self._metadata}
 
     def _abandon(self) -> None:
-        if self._link is not None:
-            self._link.abandon()
-            self._link = None
+        if self._connection is not None:
+            self._connection.abandon()
+            self._connection = None
 
     def close(self) -> None:
-        if self._link is not None:
-            self._link.close()
+        if self._connection is not None:
+            self._connection.close()
         self._abandon()
 
 
@@ -222,8 +222,8 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         cure = f"--template {' or '.join(cut)}, of servers with this path: it keeps the connection open"
         yield idle_cut(min(cut.values()), cure)
     url = urlunsplit(parts)
-    with closing(Link(url, {}, Bounds(url, PATIENCE_S, 0), PATIENCE_S, compression="deflate")) as link:
-        if link.compresses:
+    with closing(Connection(url, {}, Bounds(url, PATIENCE_S, 0), PATIENCE_S, compression="deflate")) as connection:
+        if connection.compresses:
             what = "it compresses for clients that offer it, as libraries do: each observation is deflated first"
             cure = "connect with compression=None, as openpi's and s2a-bench's clients do, or turn it off in the server"
             yield Finding("compression", "advice", what, cure)

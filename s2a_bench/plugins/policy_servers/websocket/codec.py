@@ -5,7 +5,7 @@ An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"s
 them. Arrays are of numbers and texts: no objects (dtype kind O), no records (V), no complex numbers (c), which openpi
 refuses too.
 
-Our client says who it is in a header of its handshake, `MARKS_HEADER`. Then its observations have what
+Our client announces itself in a header of its handshake, `MARKS_HEADER`. Then its observations have what
 `observed` adds, and each answer is followed by one more frame with the server's marks.
 """
 
@@ -24,7 +24,7 @@ MARKS_HEADER: Final = "S2A-Marks"
 OURS: Final = "s2a-bench"
 """The ``server`` of our server's greeting."""
 SCHEME: Final = "Api-Key"
-"""Of the Authorization header, as openpi's client sends it."""
+"""The scheme of the Authorization header that openpi's client sends."""
 HEALTH: Final = "/healthz"
 ACTIONS, TYPE, TIMING, INDICES = "actions", "type", "server_timing", "action_indices"
 PARTIAL, FINAL = "partial", "final"
@@ -54,7 +54,7 @@ def packb(value: Any, *, text_keys: bool = False) -> bytes:
 
 def _packable(value: Any) -> Any:
     if not isinstance(value, (np.ndarray, np.generic)):
-        raise TypeError(f"{type(value).__name__} is none of its types")
+        raise TypeError(f"{type(value).__name__} is not one of its types")
     if value.dtype.kind in UNSAFE:
         raise ValueError(f"arrays of type {value.dtype} do not travel")
     if isinstance(value, np.generic):

@@ -27,14 +27,14 @@ QUEUED: Final = 4
 CLOSING_S: Final = 1.0
 QUOTED: Final = 200
 REFUSED: Final = "; refused: a wrong path or a key; see `url` and `api_key_env`"
-"""Of 403 too, with which Starlette answers an unknown path."""
+"""The advice for 401 and 403; Starlette answers an unknown path with 403."""
 
 
 class Broken(RequestFailed):
     """The server has closed the connection, orderly or not."""
 
 
-class Link:
+class Connection:
     """A connection that fails in one line where more comes, or later, than the bounds of its request allow."""
 
     def __init__(
@@ -85,7 +85,7 @@ class Link:
             uri = parse_uri(self._url)
             return socket.create_connection((uri.host, uri.port), timeout_s)
         except (WebSocketException, ValueError) as error:
-            raise TransportError(f"`url`: '{self._url}' is no URL of a WebSocket: {error}") from error
+            raise TransportError(f"`url`: '{self._url}' is not the URL of a WebSocket: {error}") from error
         except OSError as error:
             why = f" within {timeout_s:g} s" if isinstance(error, TimeoutError) else f": {error}"
             raise ServerDied(f"nothing answers at {self._url}{why}") from error
@@ -146,7 +146,7 @@ class Link:
             closed = error.rcvd if isinstance(error, ConnectionClosed) else None
             did = f"closed the connection: {closed}" if closed else f"broke the connection: {why or error}"
             return Broken(f"{self._url} {did[:QUOTED]}", starting=closed is None)
-        return RequestFailed(f"{self._url} is no WebSocket: {str(why or error)[:QUOTED]}")
+        return RequestFailed(f"{self._url} is not a WebSocket: {str(why or error)[:QUOTED]}")
 
     def close(self) -> None:
         """Close in order, for which the server has a second."""

@@ -135,7 +135,7 @@ class WebsocketServer(WebServer):
             while True:
                 self._answer(client, connection.recv())
                 self._answering.discard(client)
-        except (ConnectionClosed, Disconnected):
+        except (ConnectionClosed, Disconnected):  # a client that leaves is not a failure
             pass
         except Exception:
             _log.exception("a connection failed")
@@ -176,7 +176,7 @@ class PolicyConnection:
         self.streams = handshake.path.partition("?")[0].rstrip("/").endswith(STREAM_PATH)
         """Whether actions are sent one by one."""
         self.previous_ms: float | None = None
-        """What the request before took."""
+        """The duration of the previous request."""
 
     def send(self, message: bytes) -> None:
         """Send a message; raises Disconnected."""

@@ -55,7 +55,7 @@ class WebsocketReader(HttpReader):
             if opcode in {Opcode.TEXT, Opcode.BINARY}:
                 seen, size, data = self.begin_request(self._what) if up else self.begin_answer(), 0, bytearray()
                 text = opcode == Opcode.TEXT
-            wanted = seen and not self._extensions and (not up or self._what not in self._known)
+            wanted = seen and not self._extensions and (not up or self._what not in self._kinds)
             most = (MOST_BYTES if up else DECODED_BYTES) - len(data) if wanted else 0
             frame, length = yield from _frame(incoming, max(most, CONTROL_BYTES), self._extensions, mask=up)
             if frame.opcode in CTRL_OPCODES:
@@ -117,7 +117,7 @@ def _frame(
 
 
 def _decoded(data: bytes, *, text: bool) -> Any:
-    """Read a message: MessagePack, or a text, which may be JSON; None for bytes that are no message."""
+    """Read a message: MessagePack, or a text, which may be JSON; None for bytes that are not a message."""
     if text:
         return loaded(data)
     with suppress(RequestFailed):

@@ -33,7 +33,7 @@ from s2a_bench.types import Frame, Piece, Pixels, Request
 ANSWER_BYTES: Final = 16 << 20
 """Most bytes of an answer; libzmq takes no more."""
 POLL_MS: Final = 20
-"""How often a waiting request checks its connection."""
+"""Interval at which a waiting request checks its connection."""
 KEPT_FILES: Final = 16
 """Most pictures whose memory is kept for the next request."""
 WRONG_POLICY: Final = b"ERROR"
@@ -46,7 +46,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         super().__init__(wiring, alive)
         self._key = read_key(wiring.options.api_key_env)
         self._files: dict[tuple[int, int, int], PictureFile] = {}
-        self._link: Dealer | None = None
+        self._connection: Dealer | None = None
         self._connected = False
         self._layout: str = wiring.options.layout
         answer: Any = None
@@ -59,29 +59,30 @@ class ZmqClient(PolicyClient[ZmqOptions]):
     def _configurations(self) -> tuple[Any, set[str]]:
         """Return the server's modality configurations and their marks: its layout, and whether it is ours."""
         bounds = self._wiring.bounds(self._url, 1)
-        with closing(Dealer(self._url, self._wiring.timeout_s, self._alive, bounds)) as link:
-            return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
+        with closing(Dealer(self._url, self._wiring.timeout_s, self._alive, bounds)) as connection:
+            asks = pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()})
+            return self._read(connection.exchange(asks, bounds))
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
-        link = self._open(bounds, trace)
-        actions = layouts.actions_in(self._checked(link.exchange(self._pack(request, trace), bounds)))
+        connection = self._open(bounds, trace)
+        actions = layouts.actions_in(self._checked(connection.exchange(self._pack(request, trace), bounds)))
         seen_ns = now_ns()
         yield from actions
         if self._native:
-            trace.receive(observed.remote_of(self._checked(link.receive(bounds))))
+            trace.receive(observed.remote_of(self._checked(connection.receive(bounds))))
         trace.marks.append(("return" if self._native else "server", seen_ns))
 
     def _open(self, bounds: Bounds, trace: Trace) -> Dealer:
         """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
-        if self._link is not None and not self._link.stands():
+        if self._connection is not None and not self._connection.stands():
             self.close()
-        if self._link is None:
+        if self._connection is None:
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-            self._link = Dealer(self._url, self._wiring.timeout_s, self._alive, bounds)
+            self._connection = Dealer(self._url, self._wiring.timeout_s, self._alive, bounds)
             self._connected = True
             trace.mark("connect")
-        return self._link
+        return self._connection
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         if self._modalities:
@@ -99,7 +100,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return body
 
     def _picture(self, frame: Frame, place: int, trace: Trace) -> Pixels:
-        """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
+        """Return a picture as it is sent; YUYV frames are converted straight into the send buffer."""
         if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
             return super()._picture(frame, place, trace)
         if len(self._files) > KEPT_FILES:

@@ -43,7 +43,7 @@ ONES: Final = ("x", "y", "z", "roll", "pitch", "yaw", "rx", "ry", "rz", "rw", "p
 WIDTHS: Final = {**dict.fromkeys(ONES, 1), "waist": 3, "single_arm": 5, "leg": 6, "arm": 7, "eef_9d": 9}
 """Part of a robot, left as right -> numbers of its state in GR00T's own embodiments; no server tells of them."""
 STATE_AXES, PICTURE_AXES = 2, 4
-"""Of N1.5's arrays without a batch."""
+"""The axes of N1.5's arrays without a batch."""
 
 
 def marked(marks: set[str]) -> str:
@@ -72,7 +72,7 @@ def actions_in(answer: Any) -> list[Action]:
 
 
 def modalities(layout: str) -> dict[str, Any]:
-    """Return what ``get_modality_config`` tells of our server; `AUTO` has the marks of N1.6 and of N1.7."""
+    """Return our server's answer to ``get_modality_config``; `AUTO` has the marks of N1.6 and of N1.7."""
     configs: dict[str, Any] = {}
     marks = CONFIG_MARKS.values() if layout == AUTO else [CONFIG_MARKS.get(layout, CONFIG_MARKS[N1_6])]
     for modality, name in NAMES.items():

@@ -29,7 +29,7 @@ from s2a_bench.transport.serving import RETRY_AFTER_S, Core, SharedSourceWorkers
 from s2a_bench.types import Request
 
 POLL_MS: Final = 100
-"""How long a server that stops may wait for a message."""
+"""The longest wait for a message of a server that stops."""
 QUEUED: Final = 8
 """Messages of one client that libzmq keeps for us; those beyond wait at the client."""
 READING: Final = 16
@@ -37,7 +37,7 @@ READING: Final = 16
 ENVELOPE: Final = 4
 """Frames kept before a message: the identity, those of proxies, an empty one; further ones are discarded."""
 MARKS_AFTER_S: Final = 0.0005
-"""Between an answer and the marks behind it: computed at once they take 0.15 ms from the answer under way."""
+"""Pause between an answer and its marks: computed at once they would take 0.15 ms from the running answer."""
 REPLIES: Final = "inproc://replies"
 
 Send: TypeAlias = Callable[[bytes | memoryview], None]
@@ -117,7 +117,7 @@ class ZmqServer:
         return self._taken(frames, trace)
 
     def _taken(self, frames: list[Any], trace: Trace) -> Callable[[], None] | None:
-        """Return what answers a message: its last frame, behind the envelope that goes back with the reply."""
+        """Return the job that answers a message: its last frame, behind the envelope that goes back with the reply."""
         send = partial(self._reply, [frame.bytes for frame in frames[:-1]])
         with ExitStack() as held:
             try:
@@ -146,11 +146,11 @@ class ZmqServer:
                 send(_error(client_error(error)))
 
     def _check(self, message: Any) -> None:
-        """Raise RequestFailed for a message that is none, or has not the key, compared in constant time."""
+        """Raise RequestFailed for a malformed message, or one without the key, compared in constant time."""
         if not isinstance(message, dict):
             raise RequestFailed(f"a request is a map, not {type(message).__name__}")
-        given = message.get(layouts.TOKEN)
-        token = given.encode(errors="replace") if isinstance(given, str) else b""
+        value = message.get(layouts.TOKEN)
+        token = value.encode(errors="replace") if isinstance(value, str) else b""
         if self._key and not hmac.compare_digest(token, self._key):
             raise RequestFailed(f"Unauthorized: this server wants its key as {layouts.TOKEN}")
 
@@ -165,8 +165,8 @@ class ZmqServer:
             return {}
         if endpoint == layouts.KILL:
             raise RequestFailed("this server is not ended over the network: stop its process")
-        known = f"{layouts.GET_ACTION}, {layouts.PING}, {layouts.RESET}, {layouts.MODALITIES}"
-        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is none of {known}")
+        endpoints = f"{layouts.GET_ACTION}, {layouts.PING}, {layouts.RESET}, {layouts.MODALITIES}"
+        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is not one of {endpoints}")
 
     def _reply(self, envelope: list[bytes], message: bytes | memoryview) -> None:
         """Have the thread that has the ROUTER send a message."""
@@ -210,4 +210,4 @@ def _resolved(host: str) -> str:
     try:
         return host if ":" in host else socket.gethostbyname(host)
     except OSError as error:
-        raise TransportError(f"`host`: '{host}' is no address of this machine: {error}") from error
+        raise TransportError(f"`host`: '{host}' is not an address of this machine: {error}") from error

@@ -1,4 +1,4 @@
-"""Reads what passes between a client and a server of GR00T's protocol: ZMTP 3 (ZeroMQ's RFC 23) and MessagePack.
+"""Reads the messages of a client and a server of GR00T's protocol: ZMTP 3 (ZeroMQ's RFC 23) and MessagePack.
 
 A message of several frames is one request or answer: the last one is the body, those before it are its envelope. Of a
 request only the head is read, for its endpoint, unless it is the first of its kind.
@@ -20,7 +20,7 @@ from s2a_bench.transport.tap import DECODED_BYTES, FAILED, MOST_BYTES, Incoming,
 MORE, LONG, COMMAND = 1, 2, 4
 """Flags of a frame."""
 MECHANISMS: Final = (b"NULL", b"PLAIN")
-"""Those that do not encrypt what follows, as CURVE does."""
+"""The mechanisms without encryption; CURVE encrypts all that follows."""
 PING: Final = b"\x04PING"
 HEAD: Final = 512
 """Bytes of a request in which its endpoint stands."""

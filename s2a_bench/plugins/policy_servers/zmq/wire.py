@@ -32,7 +32,7 @@ BEFORE: Final = 128
 """Bytes of the header of a picture, and of most."""
 
 _NUMBERS = re.compile(r"[<>|=](b1|[iu][1248]|f[248])")
-"""What msgpack-numpy calls types of numbers."""
+"""The names of number types in msgpack-numpy."""
 
 
 class PictureFile:
@@ -62,7 +62,7 @@ def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: boo
 
     def plain(value: Any) -> Any:
         if not isinstance(value, np.ndarray):
-            raise TypeError(f"{type(value).__name__} is none of its types")
+            raise TypeError(f"{type(value).__name__} is not one of its types")
         if maps:  # its elements are packed from where they are
             solid = np.ascontiguousarray(value)
             data = solid.reshape(-1).view(np.uint8).data
@@ -104,7 +104,7 @@ def read(data: Any) -> tuple[Any, set[str]]:
 
 
 def _array_in(fields: Mapping[str, Any]) -> Any:
-    """Return the read-only array, or scalar, in a map of msgpack-numpy; raises RequestFailed for what is none."""
+    """Return the read-only array, or scalar, in a map of msgpack-numpy; raises RequestFailed for anything else."""
     kind, descr, data = fields.get("kind") or b"", fields["type"], fields["data"]
     shape = fields.get("shape") if fields["nd"] else []
     kind = kind.decode("latin-1") if isinstance(kind, bytes) else kind

@@ -30,7 +30,7 @@ REFERENCE: Final = Path(__file__).resolve().parents[4] / "results" / "reference"
 CHECKED: Final = 2
 """Pipelines that `check` measures."""
 LONGEST_PAUSE_S: Final = 5.0
-"""Between its requests: TCP's window has fallen to its first by then."""
+"""The longest pause between its requests: TCP's window has fallen to its initial size by then."""
 MB: Final = 1e6
 _DURATION: Final = re.compile(r"(\d+\.?\d*)(ms|s)")
 
@@ -71,7 +71,7 @@ class AdviseConfig(Options):
 
     @property
     def period_ms(self) -> float:
-        """From one request to the next; 0 for one after another."""
+        """Return the time from one request to the next; 0 for one after another."""
         return 1e3 / self.rate if self.rate else 0.0
 
     @property

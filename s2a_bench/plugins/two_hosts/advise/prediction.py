@@ -1,4 +1,4 @@
-"""Which transport for a link: the fitted lines of a sweep of transports, plus what the link takes.
+"""Predict each transport over a link: the fitted lines of a sweep of transports, plus the time that the link takes.
 
 The sweep ran without a link, on one machine: its lines hold the work of both ends. The link adds its delays, and the
 time in which its rate carries the bytes that the pipeline sends. Both are the median's; losses are not predicted.
@@ -29,15 +29,15 @@ from s2a_bench.writers.tables import ABSENT, TextTable, number
 HEADERS: Final = 1500 / 1448
 """Bytes of IP packets for each byte of a body over TCP: Ethernet's 1,500 with time stamps."""
 BBR_GAIN: Final = 2.89
-"""Of the rate at which BBR's start sends, over the rate that it has seen (Cardwell et al., 2016): 2 / ln 2."""
+"""The gain of BBR's start: its sending rate over the rate that it has seen (Cardwell et al., 2016), 2 / ln 2."""
 PACKET_BYTES, INITIAL_WINDOW, RTO_MS = 1500, 10, 200.0
 """Linux: bytes and packets of the first window (RFC 6928), and the timeout over the round trip (`tcp_rto_min`)."""
 MOST_HALVINGS: Final = 30
-"""Of a window, after which it is the initial one."""
+"""The most halvings of a window, after which it is the initial one."""
 WAITS: Final = 0.05
 """Share of requests that wait longer than `Advice.wait_ms`."""
 HALF: Final = 0.5
-"""Of the rate: from it on a link without a deadline is *unclear*."""
+"""The share of the rate from which on a link without a deadline is *unclear*."""
 PREDICTION: Final = (
     "End to end without inference: the sweep's line at this size of pictures, and the link. Intervals: 95 % (Student's "
     f"t) of a launch around the line, the {OFF:.0%} and {DELAY_OFF_MS} ms a way by which a link may be off, "
@@ -68,7 +68,7 @@ class Advice:
     load: float
     """Share of the link's rate that the requests take."""
     wait_ms: float | None
-    """What 95 % of requests wait less than, if those of many robots share the rate; None: there is no limit."""
+    """The wait that 95 % of the requests stay below, if many robots share the rate; None: unbounded."""
     meets: bool | None
     """Whether it meets deadline and rate, in 95 % of requests; None if only perhaps."""
     measured_ms: float | None = None
@@ -83,14 +83,14 @@ class Advice:
 
     @property
     def limit(self) -> str:
-        """What takes the most: the link, coding, or the transport."""
+        """Return the largest part: the link, coding, or the transport."""
         transport_ms = self.e2e_ms - self.link_ms - self.coding_ms
         parts = {"link": self.link_ms, "coding": self.coding_ms, "transport": transport_ms}
         return max(parts, key=lambda name: parts[name])
 
     @property
     def inside(self) -> bool | None:
-        """Whether what was measured lies in the interval; None without either."""
+        """Whether the measured value lies in the interval; None without either."""
         if self.measured_ms is None or self.ends_ms is None:
             return None
         return self.ends_ms[0] <= self.measured_ms <= self.ends_ms[1]

@@ -36,7 +36,7 @@ SIOCSIFFLAGS, SIOCSIFADDR, SIOCSIFDSTADDR = 0x8914, 0x8916, 0x8918
 RTM_NEWLINK, NLM_F_REQUEST, IFLA_TXQLEN = 16, 1, 13
 IFF_UP: Final = 0x1
 QUEUE_PACKETS: Final = 10_000
-"""Of a device, so that a packet waits for the relay rather than is lost."""
+"""The queue of a device, so that a packet waits for the relay instead of being lost."""
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -68,7 +68,7 @@ class EmulatedLink(Around):
         return replace(origin, link="emulated", link_profile=self.profile.about)
 
     def totals(self) -> dict[str, Any]:
-        """Return what the relay carried and lost, and how late it was."""
+        """Return the relay's counts of packets carried and lost, and how late it was."""
         return {"link": {"relay": self._relay.ask()}}
 
 
@@ -130,7 +130,7 @@ def _configure(tun: int, own: str, peer: str) -> None:
     """Give a new device a loopback address in place of ``lo``, so that servers bind where they always do."""
     fcntl.ioctl(tun, TUNSETIFF, struct.pack("16sH22x", DEVICE, IFF_TUN | IFF_NO_PI))
     conf = Path("/proc/sys/net")
-    (conf / "ipv4/conf/link/route_localnet").write_text("1")
+    (conf / "ipv4/conf/link/route_localnet").write_text("1")  # else the kernel drops 127/8 on a device that is not lo
     with suppress(OSError):  # a kernel without IPv6
         (conf / "ipv6/conf/all/disable_ipv6").write_text("1")
 

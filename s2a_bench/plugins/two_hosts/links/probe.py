@@ -24,7 +24,7 @@ RATE_S: Final = 1.0
 OFFERED: Final = 1.15
 """Offered load over the rate."""
 IP_BYTES, UDP_BYTES, PACKET_BYTES, SMALL_BYTES = 20, 8, 1500, 128
-"""Of headers; of a full packet, and of one of the counts and round trips, headers included."""
+"""The sizes of headers, of a full packet, and of a packet for counts and round trips, headers included."""
 FRAGMENTS: Final = 10
 """Packets of a datagram where none is lost: Python sends some 50,000 datagrams a second."""
 COUNTED: Final = 2000
@@ -43,7 +43,7 @@ AT_ONCE: Final = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Measurement:
     what: str
     unit: str
     profile: float
@@ -85,7 +85,7 @@ class _Probe:
         self._directions = up, down = link.directions
         self._round_s = sum(way.delay_ms + way.jitter_ms for way in (up, down)) / 1e3
 
-    def measure(self) -> Iterator[Found]:
+    def measure(self) -> Iterator[Measurement]:
         up, down = self._directions
         if up.steps or down.steps:
             return
@@ -95,7 +95,7 @@ class _Probe:
         if there_ms:
             usual_ms = sum(1e3 * way.least_s(SMALL_BYTES) + way.jitter_ms / 2 for way in (up, down)) / 2
             added_ms = (median(there_ms) - median(here_ms)) / 2
-            yield Found("added one-way delay", "ms", usual_ms, added_ms, DELAY_OFF_MS + OFF * usual_ms)
+            yield Measurement("added one-way delay", "ms", usual_ms, added_ms, DELAY_OFF_MS + OFF * usual_ms)
         for name, way, sender, receiver in ways:
             yield self._loss(name, way, sender, receiver)
             if way.burst_bytes and math.isfinite(way.burst_mbps):
@@ -119,23 +119,23 @@ class _Probe:
                 times_ms.append((now_ns() - sent_ns) / 1e6)
         return times_ms
 
-    def _loss(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
+    def _loss(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Measurement:
         mbps = min(way.mbps / 2, COUNTED_PER_S * SMALL_BYTES * 8e-6)
         lost = 1 - len(self._train(sender, receiver, COUNTED, SMALL_BYTES, mbps)) / COUNTED
         spread = SIGMAS * math.sqrt(way.loss * (1 - way.loss) / COUNTED)
-        return Found(f"loss {name}", "", way.loss, lost, spread + STRAY)
+        return Measurement(f"loss {name}", "", way.loss, lost, spread + STRAY)
 
-    def _burst(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
+    def _burst(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Measurement:
         SystemClock().sleep_until_ns(now_ns() + round(way.burst_bytes * 8e3 / way.mbps))  # until the credit is full
         arrivals = self._train(sender, receiver, int(way.burst_bytes // PACKET_BYTES), PACKET_BYTES, math.inf)
         measured = _mbps(arrivals, PACKET_BYTES)
-        return Found(f"burst {name}", "Mbit/s", way.burst_mbps, measured, OFF * way.burst_mbps)
+        return Measurement(f"burst {name}", "Mbit/s", way.burst_mbps, measured, OFF * way.burst_mbps)
 
-    def _rate(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
+    def _rate(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Measurement:
         mbps, size = way.mbps * OFFERED / (1 - way.loss), PACKET_BYTES * (1 if way.loss else FRAGMENTS)
         count = math.ceil(RATE_S * mbps * 125e3 / size)
         arrivals = self._train(sender, receiver, count, size, mbps)[math.ceil(way.burst_bytes / size) :]
-        return Found(f"rate {name}", "Mbit/s", way.mbps, _mbps(arrivals, size), OFF * way.mbps)
+        return Measurement(f"rate {name}", "Mbit/s", way.mbps, _mbps(arrivals, size), OFF * way.mbps)
 
     def _train(self, sender: socket.socket, receiver: socket.socket, count: int, size: int, mbps: float) -> list[int]:
         """Send packets at a rate; return when each that was not lost arrived, in ns."""
@@ -161,11 +161,11 @@ class _Probe:
 
 
 def _socket(address: str, stack: ExitStack) -> socket.socket:
-    made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    made.bind((address, 0))
+    receiver = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    receiver.bind((address, 0))
     with suppress(PermissionError):  # the usual buffer holds some 180 packets
-        made.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
-    return made
+        receiver.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
+    return receiver
 
 
 def _receive(receiver: socket.socket, data: bytes) -> None:

@@ -153,7 +153,7 @@ def main() -> None:
     with suppress(OSError):  # not allowed in a user namespace: then the scheduler decides
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    gc.disable()
+    gc.disable()  # a collection would delay packets
     control, answers = sys.stdin.buffer, sys.stdout
     job = json.loads(control.readline())
     number = control.fileno()

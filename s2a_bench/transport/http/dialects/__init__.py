@@ -73,9 +73,9 @@ def open_dialect(name: str, options: HttpOptions | None = None) -> Dialect:
     dialect = DIALECTS[name]()
     if options is not None:
         own = dialect.options.model_fields if dialect.options else {}
-        for given in options.of_dialects.difference(own, options.without_effect):
-            takers = [each for each, kind in DIALECTS.loaded() if kind.options and given in kind.options.model_fields]
+        for unread in options.of_dialects.difference(own, options.without_effect):
+            takers = [each for each, kind in DIALECTS.loaded() if kind.options and unread in kind.options.model_fields]
             choice = f"leave it out, or choose `dialect` {' or '.join(takers)}"
-            raise UsageError(f"`{given}`: the dialect '{name}' takes none; {choice}")
+            raise UsageError(f"`{unread}`: the dialect '{name}' takes none; {choice}")
         dialect.configure(options)
     return dialect

@@ -99,7 +99,7 @@ def endpoint(base: str, root: str, path: str, query: str = "") -> str:
     try:
         url = urlsplit(base)
     except ValueError as error:
-        raise UsageError(f"`url`: '{base}' is no URL: {error}") from error
+        raise UsageError(f"`url`: '{base}' is not a URL: {error}") from error
     whole = url.path.rstrip("/")
     if not whole.endswith(path):
         whole = whole.removesuffix(root) + root + path

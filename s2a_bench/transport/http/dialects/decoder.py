@@ -17,7 +17,7 @@ from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import Framing
 
 DONE = "[DONE]"
-"""OpenAI's last message, which is no JSON."""
+"""OpenAI's last message, which is not JSON."""
 
 QUOTED = 120
 """Characters of a message that an error quotes."""

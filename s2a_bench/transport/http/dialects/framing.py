@@ -8,14 +8,14 @@ from typing import Protocol
 
 class Framing(Protocol):
     def feed(self, data: bytes) -> Iterator[str | bytes]:
-        """Yield the messages that these bytes complete; raises ValueError for bytes that are none."""
+        """Yield the messages that these bytes complete; raises ValueError for malformed bytes."""
 
     def end(self) -> Iterator[str | bytes]:
         """Yield the last message after the end of the body."""
 
 
 class Lines:
-    """Lines that end with CR LF, LF or CR (WHATWG HTML, 9.2.6); bytes that are no UTF-8 become U+FFFD."""
+    """Lines that end with CR LF, LF or CR (WHATWG HTML, 9.2.6); bytes that are not UTF-8 become U+FFFD."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []

@@ -48,7 +48,7 @@ class Gemini(Dialect):
             try:
                 names = [text_of(one["name"]) for one in get(f"{root}/models")["models"] if _answers(one)]
                 return root, model or names[0].removeprefix("models/")
-            except NO_LIST:
+            except NO_LIST:  # it may answer under the other version
                 continue
         return base, model or first_model(url.removesuffix("/v1beta"), get)[1] or NO_MODEL  # a gateway's list
 

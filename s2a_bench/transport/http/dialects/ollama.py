@@ -44,7 +44,7 @@ class Ollama(Dialect):
         finish = text_of(message.get("done_reason") or "stop") if message.get("done") else ""
         facts = {**numbers(message, COUNTS), **numbers(message, DURATIONS, 1e-6)}
         if {TOTAL_MS, PROMPT_MS, PREDICTED_MS} <= facts.keys():
-            known = facts[PROMPT_MS] + facts[PREDICTED_MS] + facts.get(LOAD_MS, 0.0)
-            facts[OUTSIDE_MODEL_MS] = facts[TOTAL_MS] - known
+            model_ms = facts[PROMPT_MS] + facts[PREDICTED_MS] + facts.get(LOAD_MS, 0.0)
+            facts[OUTSIDE_MODEL_MS] = facts[TOTAL_MS] - model_ms
         thinking = text_of(content.get("thinking") or "")
         return Event(text_of(content.get("content") or "") or None, -1, thinking, finish, facts)

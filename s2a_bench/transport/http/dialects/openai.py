@@ -105,6 +105,7 @@ class LlamaServer(OpenAI):
     takes_grammar = True
 
     def _extra(self, request: Request) -> dict[str, Any]:
+        # a repeated picture hits the KV cache: 40 ms to the first token instead of 136 (a tiny model)
         return {"cache_prompt": False, **({"grammar": request.grammar} if request.grammar else {})}
 
 

@@ -26,7 +26,7 @@ class Tgi(Dialect):
         return {"inputs": "".join([*marked, request.prompt]), "parameters": parameters}
 
     def event(self, message: Any) -> Event:
-        """Read one token; the last event has the whole text too, and special tokens are no text."""
+        """Read one token; the last event has the whole text too, and special tokens have no text."""
         token = message.get("token") or {}
         details = message.get("details") or {}
         finish = ""

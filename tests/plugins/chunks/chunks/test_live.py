@@ -379,7 +379,7 @@ def test_answers_that_no_robot_can_act_on_are_one_line(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rules": "mean,oracle"}, "`rules`: 'oracle' is none of calibrated, tracked, maximum, mean"),
+        ({"rules": "mean,oracle"}, "`rules`: 'oracle' is not one of calibrated, tracked, maximum, mean"),
         (
             {"rules": "tracked"},
             "`warmup`: 5 requests are too few to learn from for `epsilon` 0.01; take 99",
@@ -390,7 +390,7 @@ def test_answers_that_no_robot_can_act_on_are_one_line(
         ),
         ({"control_hz": 1e6}, "`control_hz`: 1000000.0 should be less than or equal to 10000"),
         ({"control_hz": 0.1, "seconds": 1}, "`seconds`: 1 s are less than two ticks at `control_hz` 0.1"),
-        ({"cycles": 5}, "`cycles` is none of the options"),
+        ({"cycles": 5}, "`cycles` is not one of the options"),
         ({"control_hz": 1e-300}, "`control_hz`"),
         ({"requests": {"transports": "nothing"}}, "nothing"),
         ({"requests": {"engine": {"name": "llama"}}}, "echo or replay"),

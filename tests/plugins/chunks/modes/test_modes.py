@@ -140,7 +140,7 @@ def test_time_scaling_takes_longer_ticks_and_never_shorter_ones_than_asked() -> 
 @pytest.mark.parametrize(
     ("written", "message"),
     [
-        ("wait", "`modes`: 'wait' is none of sync, queue, streamed, replace, aggregate"),
+        ("wait", "`modes`: 'wait' is not one of sync, queue, streamed, replace, aggregate"),
         ("queue?trigger=-1", "`modes`: queue: trigger = '-1': input should be greater than or equal to 0"),
         ("replace?execute=0", "`modes`: replace: execute = '0'"),
     ],
