@@ -397,7 +397,7 @@ def test_columns_are_read_alone_and_their_texts_are_categories_in_order_of_appea
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "no run folder"),
+        (None, "not a run folder"),
         ('{"schema": "s2a-bench/9"}', "s2a-bench/9.*s2a-bench/1"),
         (
             '{"schema": "s2a-bench/1", "command": "latency", "state": "finished", "environment": {"affinity": ["3"]}}',
