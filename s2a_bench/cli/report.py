@@ -74,10 +74,13 @@ compare = command(_compare, CompareConfig)
 
 
 def _report(config: ReportConfig) -> None:
-    from s2a_bench.report.page.chapters import read_chapters
+    from s2a_bench.report.page.chapters import read_chapters, run_folders
     from s2a_bench.report.page.files import make_report, write_report
 
-    page = make_report(read_chapters(config.runs, against=config.against), against=config.against)
+    folders, left_out = run_folders(config.runs)
+    for line in left_out:
+        print_error(line)
+    page = make_report(read_chapters(folders, against=config.against), against=config.against)
     written = write_report(page, config)
     of_chapters = (f"{chapter.title}: {caveat}" for chapter in page.chapters for caveat in chapter.every_caveat)
     for caveat in (*page.caveats, *of_chapters):

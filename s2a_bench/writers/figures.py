@@ -38,14 +38,24 @@ WHISKERS = "Bars are medians; whiskers reach from the 10th to the 90th percentil
 
 
 def new_figure(height_in: float, caption: Iterable[str], width_in: float = WIDTH_IN) -> Figure:
-    """Make a figure on Agg, without pyplot and its global state; ``caption`` has a title and notes."""
+    """Make a figure on Agg, without pyplot and its global state; ``caption`` has a title and notes.
+
+    It is as wide as `paper_column` says if that is wider.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    figure = Figure(figsize=(max(width_in, least_width()), height_in), layout="constrained")
     FigureCanvasAgg(figure)
     figure.set_label("\n".join(map(one_line, caption)))
     return figure
+
+
+def least_width() -> float:
+    """Return the least width of a figure in inches: `WIDTH_IN`, or `PAGE_IN` where it has the width of a page."""
+    import matplotlib as mpl
+
+    return float(mpl.rcParams["figure.figsize"][0])
 
 
 def caption_of(figure: Figure) -> tuple[str, ...]:

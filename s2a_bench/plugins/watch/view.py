@@ -28,7 +28,7 @@ PARTS: Final = {
     "server": ("#BBBBBB", ""),
     "inference": GROUP_FILLS["inference"],
     "download": GROUP_FILLS["return"],
-    "think": ("#F0E442", "...."),
+    "think": ("#F0E442", ".."),
 }
 """Parts of a cycle -> colour and hatch."""
 TRAVELS: Final = ("up_bytes", "down_bytes", "pieces", "horizon", "dim")

@@ -1,4 +1,4 @@
-"""From run folders to chapters: one for a run; an overview and the runs of the cells for a sweep.
+"""From folders to chapters: one for a run; an overview and the runs of the cells for a sweep.
 
 Computed timelines of a sweep are combined into one run. Measured cells stay separate runs, since machines and moments
 differ.
@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments import Shown, Tables, experiment_of
 from s2a_bench.experiments.latency.view import against_bytes
 from s2a_bench.experiments.requests import RequestCell, RequestCells, cells_of, metric_phrase, stand_ins
@@ -22,6 +23,7 @@ from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.compare.agreement import SETTING, Difference, differences, differing_names, is_other_machine
 from s2a_bench.stats import Floats
+from s2a_bench.store.manifest import NAME as MANIFEST
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
@@ -31,6 +33,10 @@ from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
 
 MOST_CHAPTERS = 12
 """Runs of a sweep that have a chapter; the others are in the overview only."""
+OPEN_LANES = 4
+"""More panels of lanes are folded, and the first figure opens the chapter."""
+MOST_RUNS = 200
+"""Runs of a folder that are shown."""
 _AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills", "t_nom_s")
 """Options that may differ between combined timelines; they are in the name of a timeline's cell."""
 Runs = Sequence[tuple[dict[str, Any], StoredRun]]
@@ -57,6 +63,45 @@ class Chapter:
     @property
     def manifest(self) -> dict[str, Any]:
         return self.run.manifest
+
+    @property
+    def picture(self) -> str:
+        """The figure that opens the chapter, the first; empty if its few lanes do."""
+        lanes = self.content.lanes.panels if self.content.lanes else ()
+        return "" if 0 < len(lanes) <= OPEN_LANES else next(iter(self.content.figures), "")
+
+
+def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the run folders that paths name or hold, those of one folder by their start, and what is left out.
+
+    Raises UsageError if there is no run, StoreError for a path that does not exist.
+    """
+    folders: list[Path] = []
+    lines: list[str] = []
+    for path in paths:
+        if path.is_dir() and not (path / MANIFEST).exists():
+            try:
+                entries = sorted(path.iterdir())
+            except OSError as error:
+                raise StoreError(f"cannot read {path}: {error.strerror}") from error
+            held = []
+            for entry in entries:
+                try:
+                    held.append((str(read_run(entry).manifest.get("started")), entry))
+                except StoreError as error:
+                    lines.append(f"skipped: {error}")
+            if not held:
+                lines.append(f"skipped: {path} is no run folder, and holds none")
+            if len(held) > MOST_RUNS:
+                lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
+            folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
+        elif path.is_file():
+            lines.append(f"skipped: {path} is a file, no run folder")
+        else:
+            folders.append(path)
+    if not folders:
+        raise UsageError(f"no run folder: {', '.join(map(str, paths))}; name run folders, or a folder that holds some")
+    return folders, lines
 
 
 def read_chapters(paths: Sequence[Path], *, against: str = "") -> list[Chapter]:
@@ -90,7 +135,7 @@ def repeat_command(manifest: Mapping[str, Any]) -> str:
 
 def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     """Return a line for each run of another machine than the first, and one line of all other differences."""
-    lines: list[str] = []
+    unlike: dict[str, list[str]] = {}
     others: list[Difference] = []
     of_command: dict[str, StoredRun] = {}
     for chapter in chapters:
@@ -99,10 +144,12 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
         others += [each for each in every if not each.what.startswith(SETTING)]
         others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
         if what := "; ".join(str(each) for each in every if is_other_machine(each)):
-            lines.append(
-                f"{chapter.title} ran on another machine than {chapters[0].title} ({what}): "
-                "their numbers are side by side, and none combines both."
-            )
+            unlike.setdefault(what, []).append(chapter.title)
+    lines = [
+        f"{', '.join(titles[:1])}{f' and {len(titles) - 1} more' if len(titles) > 1 else ''} ran on another machine "
+        f"than {chapters[0].title} ({what}): their numbers are side by side, and none combines both."
+        for what, titles in unlike.items()
+    ]
     names = differing_names(others)
     return [*lines, f"The runs differ in {names}."] if names else lines
 
@@ -147,8 +194,10 @@ def _sweep(sweep: Sweep, against: str) -> Iterator[Chapter]:
     for place, run in enumerate(pools, 1):
         what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")
         yield _chapter(run, what, against, command=command)
+    varied = {name for settings, _ in single for name in settings if settings[name] != single[0][0].get(name)}
     for settings, run in single[:MOST_CHAPTERS]:
-        yield _chapter(run, f"{run.manifest['command']}: {settings_text(settings)}", against)
+        own = {name: value for name, value in settings.items() if name in varied or not varied}
+        yield _chapter(run, f"{run.manifest['command']}: {settings_text(own)} ({run.path.name})", against)
 
 
 def content_of(run: StoredRun, against: str) -> Shown:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments import Shown
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.page import GENERATOR, ReportConfig
 from s2a_bench.report.page.chapters import Chapter, differences_of, when
@@ -23,7 +23,7 @@ from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import document, escape, to_float
-from s2a_bench.writers.style import WIDTH_IN, paper_column
+from s2a_bench.writers.style import PAGE_IN, WIDTH_IN, paper_column
 from s2a_bench.writers.tables import Note, markdown_text, to_markdown
 
 if TYPE_CHECKING:
@@ -34,36 +34,43 @@ if TYPE_CHECKING:
 class DrawnFigure:
     """One figure as SVG for HTML, and as PDF if that is an output.
 
-    ``title`` and ``notes`` are its caption; a ``wide`` one spans both columns of a paper.
+    The picture of the answer has an SVG of the width of the page, too, which is the first. ``title`` and ``notes`` are
+    its caption; a ``wide`` one spans both columns of a paper.
     """
 
-    svg: str
+    svgs: Sequence[str]
     title: str
     notes: Sequence[str]
     wide: bool
     pdf: bytes | None
 
 
-def draw(name: str, content: Shown, *, pdf: bool) -> dict[str, DrawnFigure]:
-    """Build each figure once; ``name`` makes its ids differ from those of other figures."""
+def draw(chapter: Chapter, *, pdf: bool) -> dict[str, DrawnFigure]:
+    """Build each figure, the picture of the answer in two widths."""
+    drawn = {}
+    for place, (name, build) in enumerate(chapter.content.figures.items()):
+        with chapter.content.noted(f"figure {name}"):
+            prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', chapter.name)}-{place}-"
+            wider = [_drawn(build, f"{prefix}page-", PAGE_IN)[0]] if name == chapter.picture else []
+            svg, figure, made = _drawn(build, prefix, WIDTH_IN, pdf=pdf)
+            title, *notes = caption_of(figure)
+            drawn[name] = DrawnFigure((*wider, svg), title, notes, figure.get_figwidth() > WIDTH_IN, made)
+    return drawn
+
+
+def _drawn(
+    build: Callable[[], Figure], prefix: str, width_in: float, *, pdf: bool = False
+) -> tuple[str, Figure, bytes | None]:
+    """Return a figure as SVG without its line of provenance, as the page labels it, and as PDF with that line."""
     import matplotlib as mpl
 
-    drawn = {}
-    for place, (figure_name, build) in enumerate(content.figures.items()):
-        prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', name)}-{place}-"
-        style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
-        with content.noted(f"figure {figure_name}"), paper_column(), mpl.rc_context(style):
-            figure = build()
-            title, *notes = caption_of(figure)
-            svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
-            drawn[figure_name] = DrawnFigure(
-                inline(svg[svg.index("<svg") :], prefix),
-                title,
-                notes,
-                figure.get_figwidth() > WIDTH_IN,
-                _saved(figure, "pdf", "CreationDate") if pdf else None,
-            )
-    return drawn
+    style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
+    with paper_column(width_in), mpl.rc_context(style):
+        figure = build()
+        made = _saved(figure, "pdf", "CreationDate") if pdf else None
+        figure.suptitle("").set_in_layout(False)
+        svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
+    return inline(svg[svg.index("<svg") :], prefix), figure, made
 
 
 def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
@@ -73,13 +80,19 @@ def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
 
 
 def inline(svg: str, prefix: str) -> str:
-    """Prepare an SVG for HTML: no namespaces, metadata and styles (they would apply to the page), unique ids."""
+    """Prepare an SVG for HTML: no namespaces, metadata and styles (they would apply to the page), unique ids.
+
+    Paths keep two decimals.
+    """
     svg = re.sub(r"<!--.*?-->\s*|<(metadata|style)\b.*?</\1>\s*", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
+    svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"\s*\n|(?<=\.\d\d)\d+", "", path[0]), svg)
     svg = svg.replace("xlink:href=", "href=")
     return re.sub(r'(\bid="|href="#|url\(#)', lambda match: match[1] + prefix, svg)
 
 
+MOST_ROWS = 40
+"""A table with more rows is folded."""
 _MARK = f"<!-- {GENERATOR} -->"
 _LONG_ROWS = 30
 """A longer table needs more than one page."""
@@ -109,7 +122,7 @@ def make_report(chapters: Sequence[Chapter], *, against: str = "") -> Report:
 def write_report(report: Report, config: ReportConfig) -> list[Path]:
     """Write the outputs and return their files; raises StoreError."""
     drawn = {
-        chapter.name: draw(chapter.name, chapter.content, pdf=config.latex is not None)
+        chapter.name: draw(chapter, pdf=config.latex is not None)
         for chapter in report.chapters
         if config.page or config.latex
     }
@@ -199,7 +212,7 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         style=loader.get_source(world, "page.css")[0],
         script=loader.get_source(world, "page.js")[0],
         title=title_of_page(report.chapters),
-        chapters=[(chapter, _view(chapter), drawn.get(chapter.name, {})) for chapter in report.chapters],
+        chapters=[(chapter, _view(chapter, drawn.get(chapter.name, {}))) for chapter in report.chapters],
         judged=report.judged,
         caveats=report.caveats,
     )
@@ -213,16 +226,26 @@ def title_of_page(chapters: Sequence[Chapter]) -> str:
     return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
 
 
-def _view(chapter: Chapter) -> dict[str, Any]:
-    """Return what the page shows of a chapter besides its fields."""
+def _view(chapter: Chapter, figures: Mapping[str, DrawnFigure]) -> dict[str, Any]:
+    """Return what the page shows of a chapter besides its fields.
+
+    ``about`` is said once: the notes that several open items share, and the origin of the numbers.
+    """
     content, manifest = chapter.content, chapter.manifest
     notes = [note for table in content.tables.values() for note in table.notes if isinstance(note, Note)]
-    labels = [label for note in notes for label in note.labels]
+    labels = [*dict.fromkeys((*chapter.run.origins.labels, *(label for note in notes for label in note.labels)))]
+    opened = [content.tables[name] for name in content.page or content.main]
+    picture = figures.get(chapter.picture)
+    shared = Counter(note for item in (*opened, *filter(None, (picture,))) for note in dict.fromkeys(item.notes))
     return {
         "id": "run-" + re.sub(r"[^A-Za-z0-9_-]", "-", chapter.name),
         "started": when(manifest),
-        "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels))),
-        "more": [table for name, table in content.tables.items() if name not in content.main],
+        "labels": labels,
+        "about": [*(note for note, count in shared.items() if count > 1), chapter.run.origins.line],
+        "picture": picture,
+        "figures": [figure for figure in figures.values() if figure is not picture],
+        "opened": [table for table in opened if len(table.rows) <= MOST_ROWS],
+        "more": [each for each in content.tables.values() if each not in opened or len(each.rows) > MOST_ROWS],
         "facts": {
             "Environment": _facts(manifest.get("environment", {})),
             "Model": _facts(manifest.get("model") or {}),

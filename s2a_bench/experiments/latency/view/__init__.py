@@ -32,7 +32,8 @@ from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, e
 
 _STAGE_CELLS = 5
 """With more cells than this a narrow table has the cells as rows."""
-_MOST = 6
+_MOST = 4
+"""Bases of comparison with a sentence."""
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
@@ -42,6 +43,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
         sentences=lambda: _latency_sentences(cells),
         tables={
             "stages": lambda: stage_table(cells),
+            "groups": lambda: group_table(cells),
             "summary": lambda: summary_table(cells),
             "summary-e2e": lambda: summary_table(cells, "e2e"),
             "summary-model": lambda: summary_table(cells, "e2e_without_model") if modelled else None,
@@ -49,7 +51,8 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
             "frames": lambda: _frame_table(cells),
             "facts": lambda: fact_table(cells),
         },
-        main=["stages", "summary", "summary-model"],
+        main=["stages"],
+        page=["summary", "summary-model", "groups"],
         csvs=lambda: latency_csv(cells),
         figures=lambda: latency_figures(cells, against),
         json=lambda: latency_json(cells),
@@ -57,45 +60,48 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def _latency_sentences(cells: RequestCells) -> list[str]:
-    if not cells:
-        return []
-    mode = cells[0].about["mode"]
-    names = ", ".join(dict.fromkeys(cell.label for cell in cells))
-    requests = span_of((cell.n for cell in cells), "request")
-    pictures = " ".join((" and ".join(cells.payloads), "frames")).lstrip()
-    sentences = [f"{requests} a cell over {names}; {pictures} of {cells.observation}, {mode} mode."]
+    """Return how many times as long cells take as another, in process if there is no other: a sentence for each."""
     metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
-    for payload in dict.fromkeys(cell.payload for cell in cells):
-        medians = [
-            f"{cell.label} {number(middle.median)} ms"
-            for cell in cells
-            if cell.payload == payload and (middle := summary_of(cell.values(metric)))
-        ]
-        if medians:
-            sentences.append(f"{metric_phrase(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
-    wired = [each for each in cells.ratios if not declared_transport(each[2].pipeline).in_process]
-    times = [_times(cell, base, ratio) for of, cell, base, ratio in wired if of == metric]
-    beside = [
-        f"Without model, {_times(cell, base, ratio)}"
-        for of, cell, base, ratio in wired
-        if of == "e2e_without_model" and cell.has_ingest
+    compared = [
+        (of, cell, base, ratio)
+        for of, cell, base, ratio in cells.ratios
+        if ratio.value is not None and (of == metric or (of == "e2e_without_model" and cell.has_ingest))
     ]
-    return sentences + times[:_MOST] + beside[:_MOST]
+    wired = [each for each in compared if not declared_transport(each[2].pipeline).in_process]
+    by_base: dict[tuple[str, str], list[tuple[RequestCell, RequestCell, Ratio]]] = {}
+    for of, cell, base, ratio in wired or compared:
+        by_base.setdefault((of, base.name), []).append((cell, base, ratio))
+    sentences = [
+        ("Without model: " if of == "e2e_without_model" else "") + _difference(pairs)
+        for (of, _), pairs in by_base.items()
+    ][:_MOST]
+    if launches := max((ratio.launches for pairs in by_base.values() for *_, ratio in pairs if ratio.ci95), default=0):
+        over = f"over {launches} launches" if launches > 1 else "of one launch: the next may differ by more"
+        what = metric_phrase(metric).replace("End", "end", 1)
+        sentences.append(f"Ratios of medians [95 % interval], {what}, {over}.")
+    return sentences
+
+
+def _difference(pairs: Sequence[tuple[RequestCell, RequestCell, Ratio]]) -> str:
+    """Say how many times as long cells take as their base; an interval that holds 1 shows no difference."""
+    cell, base, _ = pairs[0]
+    than = f"{base.label}{_of(base.payload or cell.payload)}"
+    times: dict[bool, list[tuple[str, str]]] = {False: [], True: []}
+    for cell, _, ratio in sorted(pairs, key=lambda pair: -(pair[2].value or 0)):
+        same = ratio.ci95 is not None and ratio.ci95[0] <= 1 <= ratio.ci95[1]
+        times[same].append((cell.label + ("" if cell.payload == base.payload else _of(cell.payload)), interval(ratio)))
+    differ, same_as = ([" ".join(each) for each in times[same]] for same in (False, True))
+    parts = []
+    if differ:
+        name, ratio_text = times[False][0]
+        parts.append(", ".join((f"{name} takes {ratio_text} times as long as {than}", *differ[1:])))
+    if same_as:
+        parts.append(f"{'no' if parts else f'{than}: no'} difference is shown for {', '.join(same_as)}")
+    return f"{'; '.join(parts)}."
 
 
 def _of(payload: str) -> str:
     return f" with {payload} pictures" if payload else ""
-
-
-def _times(cell: RequestCell, base: RequestCell, ratio: Ratio) -> str:
-    between = ""
-    if ratio.low is not None and ratio.high is not None:
-        over = f"over {ratio.launches} launches" if ratio.launches > 1 else "of one launch"
-        bounds = interval(ratio).partition(" ")[2][1:-1].replace(",", " to")
-        between = f" (ratio of medians {over}, 95 % interval {bounds})"
-    value = "an unknown number of" if ratio.value is None else number(ratio.value)
-    of = "" if cell.payload == base.payload else _of(cell.payload)
-    return f"{cell.label}{of} takes {value} times as long as {base.label}{_of(base.payload or cell.payload)}{between}."
 
 
 _FOOT = ("residual", "round_trip", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
@@ -231,7 +237,8 @@ def _notes(cells: RequestCells) -> tuple[str, ...]:
     counts = span_of(cell.n for cell in cells)
     notes = [f"n = {counts} samples a cell, warm-ups left out." if counts else "No samples."]
     if cells:
-        notes.append(f"{cells.observation}; payload: {', '.join(cells.payloads) or 'none'}.")
+        mode = cells[0].about["mode"]
+        notes.append(f"{cells.observation}; payload: {', '.join(cells.payloads) or 'none'}; {mode} mode.")
     if shape := cells.action_shape:
         notes.append(f"Each answer is a chunk of {shape} numbers, not tokens.")
     notes += cells.engine_notes
