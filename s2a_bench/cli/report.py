@@ -93,7 +93,7 @@ def _report(config: ReportConfig) -> None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
             print_line(f"{what}: {path}{count}")
-    whole = [chapter for chapter in page.chapters if chapter.manifest.get("state") == "finished"]
+    whole = [chapter for chapter in page.chapters if chapter.run.manifest.get("state") == "finished"]
     print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 
 

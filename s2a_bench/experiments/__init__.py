@@ -47,16 +47,15 @@ Tables: TypeAlias = "dict[str, Callable[[], TextTable | None]]"
 class Shown:
     """What a run shows, each item by its file's name.
 
-    ``sentences`` are findings, the most important ones first. ``main`` are the tables that are open; a terminal shows
-    the first of them, or all tables if it is empty. ``page`` are those that are open on the page, if they are not
-    ``main``. ``figures`` are drawn when called; the first is the picture of the answer, which opens the page. ``json``
-    returns the ``--json`` object, ``lanes`` are the timelines of the page's interactive view.
+    ``sentences`` are findings, the most important first; the first of ``figures``, which are drawn when called, is the
+    picture of the answer. ``main`` are the tables that are open on the page, there in the order of ``tables``; a
+    terminal shows the first of them, or all tables if it is empty. ``json`` returns the ``--json`` object, ``lanes``
+    are the timelines of the page's interactive view.
     """
 
     sentences: Sequence[str] = ()
     tables: Mapping[str, TextTable] = field(default_factory=dict)
     main: Sequence[str] = ()
-    page: Sequence[str] = ()
     csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     json: Callable[[], dict[str, Any]] = dict
@@ -75,15 +74,7 @@ class Shown:
             self.failures.append(f"{what}: {type(error).__name__}: {error}")
 
     @classmethod
-    def build(
-        cls,
-        tables: Tables,
-        main: Sequence[str],
-        *,
-        page: Sequence[str] = (),
-        json: Callable[[], Any] = dict,
-        **others: Any,
-    ) -> Shown:
+    def build(cls, tables: Tables, main: Sequence[str], *, json: Callable[[], Any] = dict, **others: Any) -> Shown:
         """Call what builds each table and each of the ``others``, so that an error in one leaves the rest."""
         shown = cls(json=json)
         found: dict[str, Any] = {}
@@ -91,8 +82,7 @@ class Shown:
             with shown.noted(name):
                 found[name] = build()
         texts = {name: table for name in tables if (table := found.pop(f"table {name}", None))}
-        first, opened = ([name for name in names if name in texts] for names in (main, page or main))
-        return replace(shown, tables=texts, main=first, page=opened, **found)
+        return replace(shown, tables=texts, main=[name for name in main if name in texts], **found)
 
 
 @dataclass(frozen=True, slots=True)

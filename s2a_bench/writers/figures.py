@@ -17,7 +17,7 @@ from s2a_bench.provenance import joined
 from s2a_bench.stats import Floats
 from s2a_bench.store.files import why
 from s2a_bench.text import one_line
-from s2a_bench.writers.style import GREY, WIDTH_IN, paper_column
+from s2a_bench.writers.style import GREY, PAGE_IN, WIDTH_IN, paper_column
 from s2a_bench.writers.tables import markdown_text, number, required
 
 if TYPE_CHECKING:
@@ -38,24 +38,21 @@ WHISKERS = "Bars are medians; whiskers reach from the 10th to the 90th percentil
 
 
 def new_figure(height_in: float, caption: Iterable[str], width_in: float = WIDTH_IN) -> Figure:
-    """Make a figure on Agg, without pyplot and its global state; ``caption`` has a title and notes.
-
-    It is as wide as `paper_column` says if that is wider.
-    """
+    """Make a figure on Agg, without pyplot and its global state; ``caption`` has a title and notes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(max(width_in, least_width()), height_in), layout="constrained")
+    figure = Figure(figsize=(PAGE_IN if on_page() else width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     figure.set_label("\n".join(map(one_line, caption)))
     return figure
 
 
-def least_width() -> float:
-    """Return the least width of a figure in inches: `WIDTH_IN`, or `PAGE_IN` where it has the width of a page."""
+def on_page() -> bool:
+    """Return True if figures are as wide as a page of HTML, where panels fit beside one another."""
     import matplotlib as mpl
 
-    return float(mpl.rcParams["figure.figsize"][0])
+    return bool(mpl.rcParams["figure.figsize"][0] == PAGE_IN)
 
 
 def caption_of(figure: Figure) -> tuple[str, ...]:

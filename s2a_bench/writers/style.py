@@ -16,7 +16,7 @@ WIDE_IN: Final = 7.16
 """Both columns."""
 
 PAGE_IN: Final = 9.0
-"""The width of a page of HTML."""
+"""A page of HTML."""
 
 STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 
@@ -65,10 +65,7 @@ def cell_styles(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, st
 
 
 def paper_column(width_in: float = WIDTH_IN) -> AbstractContextManager[None]:
-    """Draw with 7 and 8 point text, thin lines, and fonts that a publisher accepts (Type 42).
-
-    Figures are at least ``width_in`` wide.
-    """
+    """Draw with 7 and 8 point text, thin lines, and fonts that a publisher accepts (Type 42); or for a page of HTML."""
     import matplotlib as mpl
 
     settings: Any = {  # newer stubs list every key

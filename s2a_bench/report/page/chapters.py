@@ -33,8 +33,6 @@ from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
 
 MOST_CHAPTERS = 12
 """Runs of a sweep that have a chapter; the others are in the overview only."""
-OPEN_LANES = 4
-"""More panels of lanes are folded, and the first figure opens the chapter."""
 MOST_RUNS = 200
 """Runs of a folder that are shown."""
 _AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills", "t_nom_s")
@@ -60,16 +58,6 @@ class Chapter:
         """Return the caveats, and what could not be built so far; figures are built last."""
         return [*self.caveats, *(f"Not shown: {failure}." for failure in self.content.failures)]
 
-    @property
-    def manifest(self) -> dict[str, Any]:
-        return self.run.manifest
-
-    @property
-    def picture(self) -> str:
-        """The figure that opens the chapter, the first; empty if its few lanes do."""
-        lanes = self.content.lanes.panels if self.content.lanes else ()
-        return "" if 0 < len(lanes) <= OPEN_LANES else next(iter(self.content.figures), "")
-
 
 def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Return the run folders that paths name or hold, those of one folder by their start, and what is left out.
@@ -79,26 +67,20 @@ def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     folders: list[Path] = []
     lines: list[str] = []
     for path in paths:
-        if path.is_dir() and not (path / MANIFEST).exists():
-            try:
-                entries = sorted(path.iterdir())
-            except OSError as error:
-                raise StoreError(f"cannot read {path}: {error.strerror}") from error
-            held = []
-            for entry in entries:
-                try:
-                    held.append((str(read_run(entry).manifest.get("started")), entry))
-                except StoreError as error:
-                    lines.append(f"skipped: {error}")
-            if not held:
-                lines.append(f"skipped: {path} is no run folder, and holds none")
-            if len(held) > MOST_RUNS:
-                lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
-            folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
-        elif path.is_file():
-            lines.append(f"skipped: {path} is a file, no run folder")
-        else:
+        if (path / MANIFEST).exists() or not path.exists():
             folders.append(path)
+            continue
+        held = []
+        for entry in sorted(path.iterdir()) if path.is_dir() else ():
+            try:
+                held.append((str(read_run(entry).manifest["started"]), entry))
+            except StoreError as error:
+                lines.append(f"skipped: {str(error).partition(': ')[0]}")
+        if not held:
+            lines.append(f"skipped: {path} is no run folder, and holds none")
+        if len(held) > MOST_RUNS:
+            lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
+        folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
     if not folders:
         raise UsageError(f"no run folder: {', '.join(map(str, paths))}; name run folders, or a folder that holds some")
     return folders, lines
@@ -139,7 +121,7 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     others: list[Difference] = []
     of_command: dict[str, StoredRun] = {}
     for chapter in chapters:
-        same = of_command.setdefault(str(chapter.manifest["command"]), chapter.run)
+        same = of_command.setdefault(str(chapter.run.manifest["command"]), chapter.run)
         every = differences(chapters[0].run, chapter.run)
         others += [each for each in every if not each.what.startswith(SETTING)]
         others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
@@ -221,14 +203,14 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
             f"{failed} failed; the table of cells has the errors, --resume --retry-failed runs them again."
         )
     cells = [cells_of(run) for _, run in runs]
-    lines, figures = against_bytes.shown(cells)
+    findings, lines, figures = against_bytes.shown(cells)
     measured = partial(measured_table, [settings for settings, _ in runs], cells)
     builders: Tables = {**lines, "overview": measured, "cells": partial(cell_table, sweep)}
     shown = Shown.build(builders, [*lines, "overview"], csvs=lambda: {"cells.csv": CsvTable.of_frame(sweep.cells)})
     line = sweep.origins.line
     tables = {name: replace(table, provenance=line) for name, table in shown.tables.items()}
     drawn = {name: partial(marked, build, *(run for _, run in runs)) for name, build in figures.items()}
-    return replace(shown, sentences=sentences, tables=tables, figures=drawn)
+    return replace(shown, sentences=[*findings, *sentences], tables=tables, figures=drawn)
 
 
 def cell_table(sweep: Sweep) -> TextTable:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,10 @@ from s2a_bench import __version__
 from s2a_bench.errors import StoreError
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.page import GENERATOR, ReportConfig
-from s2a_bench.report.page.chapters import Chapter, differences_of, when
+from s2a_bench.report.page.chapters import Chapter, differences_of
 from s2a_bench.report.verdicts import Verdicts, judge
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.run import fits
-from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
@@ -46,31 +45,25 @@ class DrawnFigure:
 
 
 def draw(chapter: Chapter, *, pdf: bool) -> dict[str, DrawnFigure]:
-    """Build each figure, the picture of the answer in two widths."""
-    drawn = {}
-    for place, (name, build) in enumerate(chapter.content.figures.items()):
-        with chapter.content.noted(f"figure {name}"):
-            prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', chapter.name)}-{place}-"
-            wider = [_drawn(build, f"{prefix}page-", PAGE_IN)[0]] if name == chapter.picture else []
-            svg, figure, made = _drawn(build, prefix, WIDTH_IN, pdf=pdf)
-            title, *notes = caption_of(figure)
-            drawn[name] = DrawnFigure((*wider, svg), title, notes, figure.get_figwidth() > WIDTH_IN, made)
-    return drawn
-
-
-def _drawn(
-    build: Callable[[], Figure], prefix: str, width_in: float, *, pdf: bool = False
-) -> tuple[str, Figure, bytes | None]:
-    """Return a figure as SVG without its line of provenance, as the page labels it, and as PDF with that line."""
+    """Build each figure, the first in two widths; its SVG has no line of provenance, as the page labels it."""
     import matplotlib as mpl
 
-    style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
-    with paper_column(width_in), mpl.rc_context(style):
-        figure = build()
-        made = _saved(figure, "pdf", "CreationDate") if pdf else None
-        figure.suptitle("").set_in_layout(False)
-        svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
-    return inline(svg[svg.index("<svg") :], prefix), figure, made
+    drawn = {}
+    for place, (name, build) in enumerate(chapter.content.figures.items()):
+        svgs: list[str] = []
+        with chapter.content.noted(f"figure {name}"):
+            for width_in in (WIDTH_IN,) if place else (PAGE_IN, WIDTH_IN):
+                prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', chapter.name)}-{place}-{len(svgs)}-"
+                style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
+                with paper_column(width_in), mpl.rc_context(style):
+                    figure = build()
+                    made = _saved(figure, "pdf", "CreationDate") if pdf and width_in == WIDTH_IN else None
+                    figure.suptitle("").set_in_layout(False)
+                    svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
+                svgs.append(inline(svg[svg.index("<svg") :], prefix))
+            title, *notes = caption_of(figure)
+            drawn[name] = DrawnFigure(svgs, title, notes, figure.get_figwidth() > WIDTH_IN, made)
+    return drawn
 
 
 def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
@@ -91,8 +84,6 @@ def inline(svg: str, prefix: str) -> str:
     return re.sub(r'(\bid="|href="#|url\(#)', lambda match: match[1] + prefix, svg)
 
 
-MOST_ROWS = 40
-"""A table with more rows is folded."""
 _MARK = f"<!-- {GENERATOR} -->"
 _LONG_ROWS = 30
 """A longer table needs more than one page."""
@@ -194,6 +185,8 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
     """Return the page, one HTML file that fetches nothing; every text of a run is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    first, *others = report.chapters
+    alone = all(first.run.path in (each.run.path, *each.run.path.parents) for each in others)  # a sweep, and its runs
     loader = PackageLoader("s2a_bench.report.page", "templates")
     world = Environment(
         loader=loader,
@@ -204,6 +197,7 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         lstrip_blocks=True,
     )
     world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
+    world.tests["long"] = lambda text: len(text) > 100  # noqa: PLR2004 - two lines on a phone
     world.filters["short"] = lambda value: f"{value:.6g}"
     return world.get_template("page.html").render(
         generator=GENERATOR,
@@ -211,57 +205,24 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         made=utc_now().replace("T", " ").replace("+00:00", " UTC"),
         style=loader.get_source(world, "page.css")[0],
         script=loader.get_source(world, "page.js")[0],
-        title=title_of_page(report.chapters),
-        chapters=[(chapter, _view(chapter, drawn.get(chapter.name, {}))) for chapter in report.chapters],
+        title=first.title if alone else f"{len(report.chapters)} runs, side by side",
+        chapters=[(chapter, _view(chapter, [*drawn.get(chapter.name, {}).values()])) for chapter in report.chapters],
         judged=report.judged,
         caveats=report.caveats,
     )
 
 
-def title_of_page(chapters: Sequence[Chapter]) -> str:
-    """Return the title of the only folder, or the number of folders; a sweep's chapters count as one."""
-    sweeps = {chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)}
-    folders = [chapter for chapter in chapters if sweeps.isdisjoint(chapter.run.path.parents)]
-    names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
-    return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
-
-
-def _view(chapter: Chapter, figures: Mapping[str, DrawnFigure]) -> dict[str, Any]:
-    """Return what the page shows of a chapter besides its fields.
-
-    ``about`` is said once: the notes that several open items share, and the origin of the numbers.
-    """
-    content, manifest = chapter.content, chapter.manifest
-    notes = [note for table in content.tables.values() for note in table.notes if isinstance(note, Note)]
-    labels = [*dict.fromkeys((*chapter.run.origins.labels, *(label for note in notes for label in note.labels)))]
-    opened = [content.tables[name] for name in content.page or content.main]
-    picture = figures.get(chapter.picture)
-    shared = Counter(note for item in (*opened, *filter(None, (picture,))) for note in dict.fromkeys(item.notes))
+def _view(chapter: Chapter, figures: Sequence[DrawnFigure]) -> dict[str, Any]:
+    """Return what the page shows of a chapter besides its fields; ``about`` are the notes that open items share."""
+    tables = chapter.content.tables
+    notes = [note for table in tables.values() for note in table.notes if isinstance(note, Note)]
+    labels = [label for note in notes for label in note.labels]
+    opened = [table for name, table in tables.items() if name in chapter.content.main]
+    noted = [*(table.notes for table in opened), *(figure.notes for figure in figures[:1])]
     return {
         "id": "run-" + re.sub(r"[^A-Za-z0-9_-]", "-", chapter.name),
-        "started": when(manifest),
-        "labels": labels,
-        "about": [*(note for note, count in shared.items() if count > 1), chapter.run.origins.line],
-        "picture": picture,
-        "figures": [figure for figure in figures.values() if figure is not picture],
-        "opened": [table for table in opened if len(table.rows) <= MOST_ROWS],
-        "more": [each for each in content.tables.values() if each not in opened or len(each.rows) > MOST_ROWS],
-        "facts": {
-            "Environment": _facts(manifest.get("environment", {})),
-            "Model": _facts(manifest.get("model") or {}),
-            "Configuration": _facts(manifest.get("configuration", {})),
-            "Seeds": _facts(manifest.get("seeds", {})),
-            "Facts of a request": [(name, fact["about"]) for name, fact in chapter.run.facts.items()],
-        },
+        "labels": [*dict.fromkeys((*chapter.run.origins.labels, *labels))],
+        "about": [note for note in dict.fromkeys(chain(*noted)) if sum(note in notes for notes in noted) > 1],
+        "figures": figures,
+        "opened": opened,
     }
-
-
-def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(facts, list) and any(isinstance(each, dict) for each in facts):
-        facts = dict(enumerate(facts))
-    if isinstance(facts, dict):
-        return [line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}".removeprefix("."))]
-    if facts is None or facts in ("", []):
-        return []
-    text = ", ".join(map(str, facts)) if isinstance(facts, list) else str(facts)
-    return [(prefix, text)]

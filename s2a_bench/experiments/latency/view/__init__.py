@@ -30,8 +30,6 @@ from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
 
-_STAGE_CELLS = 5
-"""With more cells than this a narrow table has the cells as rows."""
 _MOST = 4
 """Bases of comparison with a sentence."""
 
@@ -42,17 +40,15 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: _latency_sentences(cells),
         tables={
-            "stages": lambda: stage_table(cells),
-            "groups": lambda: group_table(cells),
             "summary": lambda: summary_table(cells),
             "summary-e2e": lambda: summary_table(cells, "e2e"),
             "summary-model": lambda: summary_table(cells, "e2e_without_model") if modelled else None,
+            "stages": lambda: stage_table(cells),
             "tokens": lambda: _token_table(cells),
             "frames": lambda: _frame_table(cells),
             "facts": lambda: fact_table(cells),
         },
-        main=["stages"],
-        page=["summary", "summary-model", "groups"],
+        main=["stages", "summary", "summary-model"],
         csvs=lambda: latency_csv(cells),
         figures=lambda: latency_figures(cells, against),
         json=lambda: latency_json(cells),
@@ -62,42 +58,32 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 def _latency_sentences(cells: RequestCells) -> list[str]:
     """Return how many times as long cells take as another, in process if there is no other: a sentence for each."""
     metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
-    compared = [
-        (of, cell, base, ratio)
-        for of, cell, base, ratio in cells.ratios
-        if ratio.value is not None and (of == metric or (of == "e2e_without_model" and cell.has_ingest))
-    ]
-    wired = [each for each in compared if not declared_transport(each[2].pipeline).in_process]
-    by_base: dict[tuple[str, str], list[tuple[RequestCell, RequestCell, Ratio]]] = {}
-    for of, cell, base, ratio in wired or compared:
-        by_base.setdefault((of, base.name), []).append((cell, base, ratio))
+    by_base: dict[tuple[bool, str, str], list[tuple[RequestCell, RequestCell, Ratio]]] = {}
+    for of, cell, base, ratio in cells.ratios:
+        if ratio.value is not None and (of == metric or (of == "e2e_without_model" and cell.has_ingest)):
+            key = declared_transport(base.pipeline).in_process, of, base.name
+            by_base.setdefault(key, []).append((cell, base, ratio))
+    wired = {key: pairs for key, pairs in by_base.items() if not key[0]} or by_base
     sentences = [
-        ("Without model: " if of == "e2e_without_model" else "") + _difference(pairs)
-        for (of, _), pairs in by_base.items()
-    ][:_MOST]
-    if launches := max((ratio.launches for pairs in by_base.values() for *_, ratio in pairs if ratio.ci95), default=0):
-        over = f"over {launches} launches" if launches > 1 else "of one launch: the next may differ by more"
-        what = metric_phrase(metric).replace("End", "end", 1)
-        sentences.append(f"Ratios of medians [95 % interval], {what}, {over}.")
-    return sentences
+        f"{of.replace('_', ' ').removeprefix('e2e ').capitalize()}, {_difference(pairs)}"
+        for (_, of, _), pairs in wired.items()
+    ]
+    return [*sentences[:_MOST], *launches_note(ratio for pairs in wired.values() for *_, ratio in pairs)]
 
 
 def _difference(pairs: Sequence[tuple[RequestCell, RequestCell, Ratio]]) -> str:
     """Say how many times as long cells take as their base; an interval that holds 1 shows no difference."""
     cell, base, _ = pairs[0]
     than = f"{base.label}{_of(base.payload or cell.payload)}"
-    times: dict[bool, list[tuple[str, str]]] = {False: [], True: []}
+    differ: list[str] = []
+    same: list[str] = []
     for cell, _, ratio in sorted(pairs, key=lambda pair: -(pair[2].value or 0)):
-        same = ratio.ci95 is not None and ratio.ci95[0] <= 1 <= ratio.ci95[1]
-        times[same].append((cell.label + ("" if cell.payload == base.payload else _of(cell.payload)), interval(ratio)))
-    differ, same_as = ([" ".join(each) for each in times[same]] for same in (False, True))
-    parts = []
-    if differ:
-        name, ratio_text = times[False][0]
-        parts.append(", ".join((f"{name} takes {ratio_text} times as long as {than}", *differ[1:])))
-    if same_as:
-        parts.append(f"{'no' if parts else f'{than}: no'} difference is shown for {', '.join(same_as)}")
-    return f"{'; '.join(parts)}."
+        name = cell.label + ("" if cell.payload == base.payload else _of(cell.payload))
+        is_same = ratio.ci95 and ratio.ci95[0] <= 1 <= ratio.ci95[1]
+        times = "" if differ or is_same else f" times as long as {than}"
+        (same if is_same else differ).append(f"{name}{' takes' if times else ''} {interval(ratio)}{times}")
+    none = f"no difference {'' if differ else f'from {than} '}is shown for {', '.join(same)}" if same else ""
+    return f"{'; '.join(filter(None, (', '.join(differ), none)))}.".replace("[", "[95 %: ", 1)
 
 
 def _of(payload: str) -> str:
@@ -114,8 +100,8 @@ _FRAME_FOOT = {
 }
 
 
-def stage_table(cells: RequestCells, *, full: bool = True) -> TextTable:
-    """Return the table of the stages in path order, a column a cell: the median, and mean ± sd if ``full``.
+def stage_table(cells: RequestCells) -> TextTable:
+    """Return the table of the stages in path order, a column a cell; the brief one has the cells as rows.
 
     Inference is below the residual, so that e2e without inference reads as one sum, and so do the rows below it.
     """
@@ -123,22 +109,18 @@ def stage_table(cells: RequestCells, *, full: bool = True) -> TextTable:
     last = ""
     for stage in cells.stages:
         if (group := cells.run.stages[stage]) != "inference":
-            rows.append(("" if group == last else group, stage, *(_entry(cell, stage, full=full) for cell in cells)))
+            rows.append(("" if group == last else group, stage, *(_entry(cell, stage, full=True) for cell in cells)))
             last = group
     below = len(rows)
     rows += [
-        ("", metric.replace("_", " "), *(_entry(cell, metric, full=full) for cell in cells)) for metric in _foot(cells)
+        ("", metric.replace("_", " "), *(_entry(cell, metric, full=True) for cell in cells)) for metric in _foot(cells)
     ]
-    title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
-    header = ("group", "stage", *cells.titles)
-    brief = None
-    if full:
-        brief = group_table(cells) if len(cells) > _STAGE_CELLS else stage_table(cells, full=False)
-    return TextTable(title, header, rows, 2, frozenset({below + 1}), _notes(cells), brief=brief)
+    title, header = "Stages in ms: median (mean ± sd)", ("group", "stage", *cells.titles)
+    return TextTable(title, header, rows, 2, frozenset({below + 1}), _notes(cells), brief=group_table(cells))
 
 
 def group_table(cells: RequestCells) -> TextTable:
-    """Return a table with groups as columns and cells as rows, for runs of many cells."""
+    """Return a table with groups as columns and cells as rows."""
     groups = [group for group in cells.groups if group != "inference"]
     foot = _foot(cells)[1:]
     columns = [*(f"{GROUP}{group}" for group in groups), *foot]

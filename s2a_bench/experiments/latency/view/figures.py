@@ -18,12 +18,12 @@ from s2a_bench.writers.figures import (
     build_bars,
     build_distribution,
     draw_over,
-    least_width,
     name_rows,
     new_figure,
+    on_page,
     write_beside,
 )
-from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, WIDE_IN, cell_styles
+from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, cell_styles
 from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def build_stage_breakdown(caption: Sequence[str], bars: Sequence[StageBar], labe
     from matplotlib.patches import Patch
 
     fills = {name: RESIDUAL_FILL if name == RESIDUAL else GROUP_FILLS[name] for name in bars[0].parts}
-    beside = least_width() > WIDE_IN
+    beside = on_page()
     panels = 2 if _differ(bars) else 1
     rows, legend_rows, row_in = (1, 1, 0.26) if beside else (panels, -(-(len(fills) + 1) // 4), 0.34)
     figure = new_figure(0.85 + rows * (0.3 + row_in * len(bars)) + 0.16 * legend_rows, caption)
