@@ -197,7 +197,7 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         lstrip_blocks=True,
     )
     world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
-    world.tests["long"] = lambda text: len(text) > 100  # noqa: PLR2004 - two lines on a phone
+    world.tests["long"] = lambda text: len(text) > 80  # noqa: PLR2004 - two lines on a phone
     world.filters["short"] = lambda value: f"{value:.6g}"
     return world.get_template("page.html").render(
         generator=GENERATOR,

@@ -52,7 +52,7 @@ def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
 
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     stalling = [cell for cell in cells if cell.p_any_stall > 0]
-    late = f"it ends up to {max(cell.mean('end_regret') or 0.0 for cell in cells):.0%} late"
+    late = f"it ends at most {max(cell.mean('end_regret') or 0.0 for cell in cells):.0%} late"
     if not stalling:
         return f"{policy} never stalls; {late}."
     worst = max(stalling, key=lambda cell: cell.stall_s)
