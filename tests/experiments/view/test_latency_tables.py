@@ -173,8 +173,8 @@ def test_a_sentence_says_what_takes_longer_and_where_no_difference_is_shown(make
     in_process = {"loopback": {"capture": 1, "inference": 100, "return": 0.3}}
     sentence, launch = show(make_run(HAND | {"http/binary": HAND["ros/topic"]} | in_process, n=5, spread=0)).sentences
     assert sentence == (
-        "Without inference, http/as-deployed takes 5.76 [95 %: 5.76, 5.76] times as long as ros/topic with raw pictures; "
-        "no difference is shown for http/binary 1.00 [1.00, 1.00]."
+        "Without inference, http/as-deployed takes 5.76 [95 %: 5.76, 5.76] times as long as ros/topic with raw "
+        "pictures; no difference is shown for http/binary 1.00 [1.00, 1.00]."
     )
     assert launch.startswith("The intervals hold for this launch only")
     alone = dict.fromkeys(("http/binary", "ros/topic"), HAND["ros/topic"])
