@@ -15,7 +15,7 @@ WIDTH_IN: Final = 3.5
 WIDE_IN: Final = 7.16
 """Both columns."""
 
-PAGE_IN: Final = 9.0
+PAGE_IN: Final = 8.0
 """A page of HTML."""
 
 STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}

@@ -73,7 +73,7 @@ def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
         held = []
         for entry in sorted(path.iterdir()) if path.is_dir() else ():
             try:
-                held.append((str(read_run(entry).manifest["started"]), entry))
+                held.append((str(read_run(entry).manifest.get("started")), entry))
             except StoreError as error:
                 lines.append(f"skipped: {str(error).partition(': ')[0]}")
         if not held:
