@@ -61,6 +61,7 @@ def test_a_folder_is_all_runs_in_it_and_what_is_no_run_is_skipped(
         ]
         page = Path("report.html").read_text()
         assert sorted(re.findall(r"<h2>.*, 2026-01-0(\d)", page)) == ["2", "3"]
+    assert f"a folder that holds some, as {folder}" in refused("report", tmp_path, code=2)
     called("report", folder)
     assert re.findall(r"<h2>.*, 2026-01-0(\d)", Path("report.html").read_text()) == ["2", "3"]
     monkeypatch.setattr("s2a_bench.report.page.chapters.MOST_RUNS", 1)

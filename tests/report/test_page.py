@@ -387,11 +387,11 @@ def test_an_svg_for_html_has_no_addresses_and_ids_of_its_own() -> None:
     svg = (
         '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="0 0 1 1">'
         "<!-- a -- b --><style>*{a: b}</style>"
-        '<metadata><x rdf="http://purl.org/"/></metadata><path id="p" clip-path="url(#c)"/>'
+        '<metadata><x rdf="http://purl.org/"/></metadata><path id="p" d="M 1.2345 2 \nL 3 4" clip-path="url(#c)"/>'
         '<use xlink:href="#p"/></svg>'
     )
     assert inline(svg, "r-") == (
-        '<svg viewBox="0 0 1 1"><path id="r-p" clip-path="url(#r-c)"/><use href="#r-p"/></svg>'
+        '<svg viewBox="0 0 1 1"><path id="r-p" d="M 1.23 2L 3 4" clip-path="url(#r-c)"/><use href="#r-p"/></svg>'
     )
 
 

@@ -82,7 +82,9 @@ def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
             lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
         folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
     if not folders:
-        raise UsageError(f"no run folder: {', '.join(map(str, paths))}; name run folders, or a folder that holds some")
+        holder = next((f", as {each.parents[1]}" for path in paths for each in path.glob(f"*/*/{MANIFEST}")), "")
+        named = ", ".join(map(str, paths))
+        raise UsageError(f"no run folder: {named}; name run folders, or a folder that holds some{holder}")
     return folders, lines
 
 

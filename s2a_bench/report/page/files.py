@@ -31,10 +31,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DrawnFigure:
-    """One figure as SVG for HTML, and as PDF if that is an output.
+    """One figure as SVG for HTML, the first also of the width of a page, and as PDF if that is an output.
 
-    The picture of the answer has an SVG of the width of the page, too, which is the first. ``title`` and ``notes`` are
-    its caption; a ``wide`` one spans both columns of a paper.
+    ``title`` and ``notes`` are its caption; a ``wide`` one spans both columns of a paper.
     """
 
     svgs: Sequence[str]
@@ -57,12 +56,12 @@ def draw(chapter: Chapter, *, pdf: bool) -> dict[str, DrawnFigure]:
                 style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
                 with paper_column(width_in), mpl.rc_context(style):
                     figure = build()
-                    made = _saved(figure, "pdf", "CreationDate") if pdf and width_in == WIDTH_IN else None
+                    as_pdf = _saved(figure, "pdf", "CreationDate") if pdf and width_in == WIDTH_IN else None
                     figure.suptitle("").set_in_layout(False)
                     svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
                 svgs.append(inline(svg[svg.index("<svg") :], prefix))
             title, *notes = caption_of(figure)
-            drawn[name] = DrawnFigure(svgs, title, notes, figure.get_figwidth() > WIDTH_IN, made)
+            drawn[name] = DrawnFigure(svgs, title, notes, figure.get_figwidth() > WIDTH_IN, as_pdf)
     return drawn
 
 
@@ -185,8 +184,8 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
     """Return the page, one HTML file that fetches nothing; every text of a run is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    first, *others = report.chapters
-    alone = all(first.run.path in (each.run.path, *each.run.path.parents) for each in others)  # a sweep, and its runs
+    paths = {chapter.run.path for chapter in report.chapters}
+    folders = [path for path in paths if paths.isdisjoint(path.parents)]  # a sweep's holds those of its runs
     loader = PackageLoader("s2a_bench.report.page", "templates")
     world = Environment(
         loader=loader,
@@ -205,7 +204,7 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         made=utc_now().replace("T", " ").replace("+00:00", " UTC"),
         style=loader.get_source(world, "page.css")[0],
         script=loader.get_source(world, "page.js")[0],
-        title=first.title if alone else f"{len(report.chapters)} runs, side by side",
+        title=report.chapters[0].title if len(folders) == 1 else f"{len(folders)} runs, side by side",
         chapters=[(chapter, _view(chapter, [*drawn.get(chapter.name, {}).values()])) for chapter in report.chapters],
         judged=report.judged,
         caveats=report.caveats,

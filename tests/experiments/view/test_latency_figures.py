@@ -94,16 +94,10 @@ def test_cells_that_differ_widely_get_a_panel_of_shares(make_run: MakeRun) -> No
     assert ends == pytest.approx([100, 100, 100])
     capture = [bar.get_width() for bar in bars(figure, 1)][::6]
     assert capture == pytest.approx([12.5, 25, 50])
-
-
-def test_panels_stand_beside_one_another_where_a_page_is_wide(make_run: MakeRun) -> None:
-    small = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
     with paper_column(PAGE_IN):
-        figure = drawn("stages", make_run(HAND | small, n=4, spread=0))
-        figure.draw_without_rendering()
-    times, shares = figure.axes
-    assert (figure.get_figwidth(), times.get_position().y0) == (PAGE_IN, shares.get_position().y0)
-    assert row_names(figure)[0] == "http/as-deployed (raw)"
+        beside = drawn("stages", make_run(HAND | small, n=4, spread=0))
+    assert beside.axes[0].get_position().y0 == beside.axes[1].get_position().y0
+    assert row_names(beside)[0] == "http/as-deployed (raw)"
 
 
 def test_a_black_box_is_left_out_by_name_or_shown_with_its_inference(make_run: MakeRun, black_box: Any) -> None:

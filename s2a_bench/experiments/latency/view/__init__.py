@@ -30,8 +30,7 @@ from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
 
-_MOST = 4
-"""Bases of comparison with a sentence."""
+_MOST_SENTENCES = 4
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
@@ -68,7 +67,7 @@ def _latency_sentences(cells: RequestCells) -> list[str]:
         f"{of.replace('_', ' ').removeprefix('e2e ').capitalize()}, {_difference(pairs)}"
         for (_, of, _), pairs in wired.items()
     ]
-    return [*sentences[:_MOST], *launches_note(ratio for pairs in wired.values() for *_, ratio in pairs)]
+    return [*sentences[:_MOST_SENTENCES], *launches_note(ratio for pairs in wired.values() for *_, ratio in pairs)]
 
 
 def _difference(pairs: Sequence[tuple[RequestCell, RequestCell, Ratio]]) -> str:

@@ -158,8 +158,7 @@ def build_stage_breakdown(caption: Sequence[str], bars: Sequence[StageBar], labe
         for name, (colour, hatch) in fills.items()
     ]
     handles += [line for line in times.get_lines() if line.get_label() == "whole"]
-    wide = -(-len(handles) // legend_rows)
-    figure.legend(handles=handles, loc="outside lower center", ncols=wide, columnspacing=1.0)
+    figure.legend(handles=handles, loc="outside lower center", ncols=-(-len(handles) // legend_rows), columnspacing=1.0)
     return figure
 
 
