@@ -157,9 +157,7 @@ def test_a_latency_run_says_n_and_interval(make_run: MakeRun) -> None:
     page = Page(page_of(make_run(manifest={"warnings": [{"code": "load", "message": "busy", "advice": "wait"}]}).path))
     text = " ".join(page.text.split())
     assert "n = 50 samples a cell, warm-ups left out. 640x480; payload: raw; request mode." in text
-    assert re.search(
-        r"http/as-deployed takes [\d.]+ \[95 %: [\d.]+, [\d.]+\] times as long as ros/topic with raw pictures", text
-    )
+    assert re.search(r"http/as-deployed takes [\d.]+ \[95 %: [\d.]+, [\d.]+\] times as long as ros/topic \(raw\)", text)
     assert "Warning [load]: busy; wait" in text
     assert "echo engine" in text
     assert page.tags["svg"] == 4  # the first figure in two widths

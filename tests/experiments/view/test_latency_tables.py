@@ -59,7 +59,7 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
     assert group_table(cells_of(run)).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
     assert "e2e less the prompt_ms it reports, which is assumed to be all" in " ".join(printed(run).split())
     (sentence,) = show(run).sentences
-    assert sentence == "Without model, http/llama-server takes 1.39 times as long as ros/topic with raw pictures."
+    assert sentence == "Without model, http/llama-server takes 1.39 times as long as ros/topic (raw)."
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> N
         *("http/as-deployed jpeg", "ros/topic jpeg"),
     )
     assert show(run).sentences == [
-        f"Without inference, http/as-deployed takes {times} times as long as ros/topic with {payload} pictures."
+        f"Without inference, http/as-deployed takes {times} times as long as ros/topic ({payload})."
         for times, payload in (("5.76", "raw"), ("2.00", "jpeg"))
     ]
 
@@ -173,13 +173,13 @@ def test_a_sentence_says_what_takes_longer_and_where_no_difference_is_shown(make
     in_process = {"loopback": {"capture": 1, "inference": 100, "return": 0.3}}
     sentence, launch = show(make_run(HAND | {"http/binary": HAND["ros/topic"]} | in_process, n=5, spread=0)).sentences
     assert sentence == (
-        "Without inference, http/as-deployed takes 5.76 [95 %: 5.76, 5.76] times as long as ros/topic with raw "
-        "pictures; no difference is shown for http/binary 1.00 [1.00, 1.00]."
+        "Without inference, http/as-deployed takes 5.76 [95 %: 5.76, 5.76] times as long as ros/topic (raw); "
+        "no difference is shown for http/binary 1.00 [1.00, 1.00]."
     )
     assert launch.startswith("The intervals hold for this launch only")
     alone = dict.fromkeys(("http/binary", "ros/topic"), HAND["ros/topic"])
     (none, _) = show(make_run(alone, n=5, spread=0)).sentences
-    assert none.startswith("Without inference, no difference from ros/topic with raw pictures is shown for http/binary")
+    assert none.startswith("Without inference, no difference from ros/topic (raw) is shown for http/binary")
     assert "as long as loopback" in show(make_run(in_process | {"ros/topic": HAND["ros/topic"]}, n=5)).sentences[0]
 
 
@@ -187,7 +187,7 @@ def test_a_sentence_says_what_takes_longer_and_where_no_difference_is_shown(make
 def test_unlike_payloads_are_compared_where_a_name_has_its_payload(make_run: MakeRun, named: bool) -> None:
     names = ("http?payload=jpeg", "ros") if named else ("http", "ros")
     run = make_run(HAND, n=4, spread=0, payloads={"http": "jpeg"}, manifest={"configuration": {"transports": names}})
-    said = "http/as-deployed with jpeg pictures takes 5.76 times as long as ros/topic with raw pictures"
+    said = "http/as-deployed (jpeg) takes 5.76 times as long as ros/topic (raw)"
     assert any(said in sentence for sentence in show(run).sentences) is named
     assert any("ratio" in name for name in summary_table(cells_of(run)).header) is named
 

@@ -86,7 +86,7 @@ def _difference(pairs: Sequence[tuple[RequestCell, RequestCell, Ratio]]) -> str:
 
 
 def _of(payload: str) -> str:
-    return f" with {payload} pictures" if payload else ""
+    return f" ({payload})" if payload else ""
 
 
 _FOOT = ("residual", "round_trip", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
