@@ -75,12 +75,15 @@ compare = command(_compare, CompareConfig)
 
 def _report(config: ReportConfig) -> None:
     from s2a_bench.report.export import write_exports
-    from s2a_bench.report.page.chapters import read_chapters
+    from s2a_bench.report.page.chapters import read_chapters, run_folders
     from s2a_bench.report.page.files import make_report, write_report
 
-    page = make_report(read_chapters(config.runs, against=config.against), against=config.against)
+    folders, left_out = run_folders(config.runs)
+    for line in left_out:
+        print_error(line)
+    page = make_report(read_chapters(folders, against=config.against), against=config.against)
     written = write_report(page, config)
-    shared = write_exports(config.runs, config.export) if config.export else []
+    shared = write_exports(folders, config.export) if config.export else []
     of_chapters = (f"{chapter.title}: {caveat}" for chapter in page.chapters for caveat in chapter.every_caveat)
     for caveat in (*page.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
@@ -94,7 +97,7 @@ def _report(config: ReportConfig) -> None:
             print_line(f"{what}: {path}{count}")
     for folder in shared:
         print_line(f"run to share: {folder}")
-    whole = [chapter for chapter in page.chapters if chapter.manifest.get("state") == "finished"]
+    whole = [chapter for chapter in page.chapters if chapter.run.manifest.get("state") == "finished"]
     print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 
 

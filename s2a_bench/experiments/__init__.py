@@ -47,9 +47,10 @@ Tables: TypeAlias = "dict[str, Callable[[], TextTable | None]]"
 class Shown:
     """What a run shows, each item by its file's name.
 
-    ``main`` are the tables that are open on the page; a terminal shows the first of them, or all tables if it is empty.
-    ``figures`` are drawn when called, ``json`` returns the ``--json`` object, ``lanes`` are the timelines of the page's
-    interactive view.
+    ``sentences`` are findings, the most important first; the first of ``figures``, which are drawn when called, is the
+    picture of the answer. ``main`` are the tables that are open on the page, there in the order of ``tables``; a
+    terminal shows the first of them, or all tables if it is empty. ``json`` returns the ``--json`` object, ``lanes``
+    are the timelines of the page's interactive view.
     """
 
     sentences: Sequence[str] = ()

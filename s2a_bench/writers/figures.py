@@ -17,7 +17,7 @@ from s2a_bench.provenance import joined
 from s2a_bench.stats import Floats
 from s2a_bench.store.files import why
 from s2a_bench.text import one_line
-from s2a_bench.writers.style import GREY, WIDTH_IN, paper_column
+from s2a_bench.writers.style import GREY, PAGE_IN, WIDTH_IN, paper_column
 from s2a_bench.writers.tables import markdown_text, number, required
 
 if TYPE_CHECKING:
@@ -42,10 +42,17 @@ def new_figure(height_in: float, caption: Iterable[str], width_in: float = WIDTH
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    figure = Figure(figsize=(PAGE_IN if on_page() else width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     figure.set_label("\n".join(map(one_line, caption)))
     return figure
+
+
+def on_page() -> bool:
+    """Return True if figures are as wide as a page of HTML, where panels fit beside one another."""
+    import matplotlib as mpl
+
+    return bool(mpl.rcParams["figure.figsize"][0] == PAGE_IN)
 
 
 def caption_of(figure: Figure) -> tuple[str, ...]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-TICKS = 6
-
 
 @dataclass(frozen=True, slots=True)
 class LaneBar:
@@ -42,14 +40,6 @@ class LanePanel:
     lanes: Sequence[Lane]
     tokens_s: Sequence[float] = ()
     complete_s: Sequence[float] = ()
-
-    @property
-    def ticks(self) -> tuple[float, ...]:
-        """Return round times from 0 to the end."""
-        from matplotlib.ticker import MaxNLocator
-
-        times = MaxNLocator(TICKS, steps=[1, 2, 5, 10]).tick_values(0, self.end_s)
-        return tuple(float(time) for time in times if time <= self.end_s)
 
 
 @dataclass(frozen=True, slots=True)

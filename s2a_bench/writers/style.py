@@ -13,6 +13,10 @@ WIDTH_IN: Final = 3.5
 """One column of a two-column paper."""
 
 WIDE_IN: Final = 7.16
+"""Both columns."""
+
+PAGE_IN: Final = 8.0
+"""A page of HTML."""
 
 STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 
@@ -22,14 +26,14 @@ GREY: Final = "#BBBBBB"
 GROUP_FILLS: Final = {
     "capture": ("#56B4E9", ""),
     "encode": ("#E69F00", "////"),
-    "pack": ("#F0E442", "...."),
+    "pack": ("#F0E442", ".."),
     "network": ("#0072B2", "\\\\\\\\"),
     "ingest": ("#999999", "xxxx"),
     "parse": ("#CC79A7", "----"),
     "decode": ("#D55E00", "||||"),
     "queue": ("#000000", ""),
     "inference": ("#666666", "++++"),
-    "server": ("#666666", "oooo"),
+    "server": ("#666666", "oo"),
     "return": ("#009E73", "xxxx"),
 }
 """Group of stages -> colour and hatch."""
@@ -60,11 +64,12 @@ def cell_styles(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, st
     return styles | {name: _OTHER_STYLES[place % len(_OTHER_STYLES)] for place, name in enumerate(others)}
 
 
-def paper_column() -> AbstractContextManager[None]:
-    """Draw with 7 and 8 point text, thin lines, and fonts that a publisher accepts (Type 42)."""
+def paper_column(width_in: float = WIDTH_IN) -> AbstractContextManager[None]:
+    """Draw with 7 and 8 point text, thin lines, and fonts that a publisher accepts (Type 42); or for a page of HTML."""
     import matplotlib as mpl
 
     settings: Any = {  # newer stubs list every key
+        "figure.figsize": (width_in, width_in),
         "font.family": "DejaVu Sans",
         "font.size": 7,
         "axes.labelsize": 8,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from html import unescape
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from tests.cli.program import called, refused
 
@@ -42,6 +44,31 @@ def test_what_is_asked_for_is_written_and_nothing_else(timeline: Path, tmp_path:
     assert sorted(timeline.rglob("*")) == before
 
 
+def test_a_folder_is_all_runs_in_it_and_what_is_no_run_is_skipped(
+    timeline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "results"
+    started = read_run(timeline).manifest["started"]
+    for name, day in (("a", 3), ("b", 2)):
+        manifest = shutil.copytree(timeline, folder / name) / "manifest.json"
+        manifest.write_text(manifest.read_text().replace(started, f"2026-01-0{day}T00:00:00+00:00"))
+    (folder / "README.md").write_text("mine")
+    (folder / "notes").mkdir()
+    for paths in ([folder], sorted(folder.iterdir())):
+        skipped = called("report", *paths).stderr.splitlines()
+        assert [line.partition(" is no run folder")[0] for line in skipped] == [
+            f"skipped: {folder / name}" for name in ("README.md", "notes")
+        ]
+        page = Path("report.html").read_text()
+        assert sorted(re.findall(r"<h2>.*, 2026-01-0(\d)", page)) == ["2", "3"]
+    assert f"a folder that holds some, as {folder}" in refused("report", tmp_path, code=2)
+    called("report", folder)
+    assert re.findall(r"<h2>.*, 2026-01-0(\d)", Path("report.html").read_text()) == ["2", "3"]
+    monkeypatch.setattr("s2a_bench.report.page.chapters.MOST_RUNS", 1)
+    assert f"{folder} holds 2 runs: the latest 1 are shown; name folders of others" in called("report", folder).stderr
+    assert re.findall(r"<h1>.*, 2026-01-0(\d)", Path("report.html").read_text()) == ["3"]
+
+
 def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: Path) -> None:
     manifest = (timeline / "manifest.json").read_text()
     cut = shutil.copytree(timeline, tmp_path / "cut")
@@ -55,7 +82,7 @@ def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: P
     ("arguments", "code", "message"),
     [
         (["/no/such/folder"], 1, "error: /no/such/folder is not a run folder"),
-        (["{here}"], 1, "is not a run folder"),
+        (["{here}", "{here}/mine.html"], 2, "error: no run folder: {here}, {here}/mine.html; name run folders"),
         (["{run}", "--against", "rivals"], 2, "--against: 'rivals' should be paper; two runs are compared with"),
         (["{run}", "--output", "{here}"], 2, "--output: {here} is a folder; name a file"),
         (["{run}", "--output", "{here}/mine.html"], 2, "s2a-bench report did not write it; name another file"),

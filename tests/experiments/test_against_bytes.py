@@ -78,7 +78,7 @@ def test_an_order_changes_between_the_measured_sizes_at_which_it_is_sure(make_ru
     assert (one.name, other.name) == ("ros/topic", "http/binary")
     assert (small, large) == (200 * 300 / 1e6, 800 * 300 / 1e6)
     assert (below.value, above.value) == pytest.approx((0.8, 1.3), rel=0.02)
-    table = shown(runs)[0]["crossings"]()
+    table = shown(runs)[1]["crossings"]()
     assert table.rows[0] == (
         *("ros/topic, raw", "http/binary, raw"),
         *("0.060", "0.802 [0.761, 0.845]", "0.240", "1.30 [1.24, 1.37]"),
@@ -102,7 +102,7 @@ def test_no_order_changes_without_two_sizes_at_which_launches_tell_it(
 ) -> None:
     runs = split(launched(make_run, **{"ratios": {100: 0.8, 200: 1.3}} | unsure))
     assert order_changes(against_bytes(runs)) == []
-    assert shown(runs)[0]["crossings"]() is None
+    assert shown(runs)[1]["crossings"]() is None
 
 
 def test_in_process_a_cell_stands_beside_each_payload(make_run: MakeRun) -> None:
@@ -127,12 +127,15 @@ def test_scaled_pictures_count_as_scaled(make_run: MakeRun) -> None:
 def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
     same = [make_run(n=5, manifest=settings(640, 480, 1)) for _ in range(2)]
     assert against_bytes(split(same)) == []
-    assert shown(split(same)) == ({}, {})
+    assert shown(split(same)) == ([], {}, {})
     assert against_bytes(split([make_run(n=5)])) == []  # a folder that says no size
 
 
 def test_tables_and_figure_say_what_answered(runs: list[StoredRun]) -> None:
-    tables, figures = shown(split(runs))
+    (sentence,), tables, figures = shown(split(runs))
+    assert sentence.startswith(
+        "With raw pictures a megabyte of pixels takes 0.300 [0.300, 0.300] ms over http/binary to "
+    )
     assert tables["crossings"]() is None  # one launch a size: no order
     assert tables["bytes"]().rows[0] == (
         *("http/binary", "raw", "1.00 [1.00, 1.00]", "0.300 [0.300, 0.300]", "2.00", "0%"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,7 +11,7 @@ import numpy as np
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.experiments.cells import Cells, json_of
-from s2a_bench.writers.figures import new_figure, shade_plane, write_beside
+from s2a_bench.writers.figures import new_figure, on_page, shade_plane, write_beside
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
@@ -58,7 +58,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
     boards = [BoardPoints(**board, points=cells.where(board=board["name"]).rows) for board in run.manifest["boards"]]
     caption = _caption(settings, boards, random=random)
     return Shown.build(
-        sentences=lambda: _sentences(cells, grid["t_nom"]),
+        sentences=lambda: [*_sentences(cells, grid["t_nom"], boards)],
         tables={
             "boundary": lambda: line_table(grid),
             "boards": lambda: board_table(boards, _notes(cells, boards, settings["jitter"]), random=random),
@@ -78,11 +78,6 @@ def grid_of(cells: Cells[BoundaryRow], duration: str) -> pd.DataFrame:
 def is_random(cells: Cells[BoundaryRow]) -> bool:
     """Return whether the plans of a point differ."""
     return bool((cells.frame["plans"] > 1).any())
-
-
-def disagreements(cells: Cells[BoundaryRow]) -> int:
-    """Count the points where formula and trial differ; meaningful for even tokens only."""
-    return int(((cells.frame["p_stall"] == 0) != cells.frame["stall_free"]).sum())
 
 
 def board_table(boards: Sequence[BoardPoints], notes: Sequence[str], *, random: bool) -> TextTable:
@@ -115,13 +110,16 @@ def line_table(grid: Mapping[str, pd.DataFrame]) -> TextTable:
     return TextTable("Slowest rate without stalls under naive, in tokens/s", header, rows, 1)
 
 
-def _sentences(cells: Cells[BoundaryRow], nominal: pd.DataFrame) -> list[str]:
-    tried = f"Naive execution was tried at {len(cells)} points of rate and tokens per skill."
+def _sentences(cells: Cells[BoundaryRow], nominal: pd.DataFrame, boards: Sequence[BoardPoints]) -> Iterator[str]:
+    for board in boards:
+        stalls = ", ".join(str(point.tokens_per_skill) for point in board.at("t_nom") if point.p_stall > 0)
+        yield f"{board.title}: naive {f'stalls at L = {stalls}' if stalls else 'never stalls'}."
     if is_random(cells):
-        stalls = int((nominal["p_stall"] > 0).sum())
-        return [tried, f"A plan stalls at {stalls} of {len(nominal)} points of the grid, run for T_nom."]
-    agree = len(cells) - disagreements(cells)
-    return [tried, f"The formula R >= L/T says whether it stalls, and is right at {agree} of {len(cells)} points."]
+        stalling = int((nominal["p_stall"] > 0).sum())
+        yield f"A plan stalls at {stalling} of {len(nominal)} points of rate and tokens per skill, run for T_nom."
+    else:
+        agree = int(((cells.frame["p_stall"] == 0) == cells.frame["stall_free"]).sum())
+        yield f"The formula R >= L/T says whether naive stalls: it is right at {agree} of {len(cells)} points tried."
 
 
 def _json(row: BoundaryRow) -> dict[str, Any]:
@@ -141,8 +139,6 @@ def _notes(cells: Cells[BoundaryRow], boards: Sequence[BoardPoints], jitter: str
     if is_random(cells):
         plans = int(cells.frame["plans"].max())
         notes.append(f"P: share of {plans} drawn plans with a stall, jitter {jitter}; the formula is for even tokens.")
-    else:
-        notes.append(f"Formula and trial agree at {len(cells) - disagreements(cells)} of {len(cells)} points.")
     if any(board.origin == "paper" for board in boards):
         rates = "EMULATED: the boards' rates are the paper's (table II); nothing was measured."
         notes.append(Note(rates, EMULATED, PAPERS))
@@ -180,7 +176,7 @@ def build_boundary(
     axes.yaxis.set_major_formatter(lambda value, _place: f"{value:g}")
     axes.set_xlabel("tokens per skill, L")
     axes.set_ylabel("rate, R (tokens/s)")
-    figure.legend(loc="outside lower center", ncols=2, columnspacing=1.0)
+    figure.legend(loc="outside lower center", ncols=4 if on_page() else 2, columnspacing=1.0)
     return figure
 
 

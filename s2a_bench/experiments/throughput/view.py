@@ -10,11 +10,7 @@ import numpy as np
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.columns import known
 from s2a_bench.experiments.references import bars_of
-from s2a_bench.experiments.requests import (
-    OF_ANSWERS,
-    launches_note,
-    span_of,
-)
+from s2a_bench.experiments.requests import OF_ANSWERS, launches_note
 from s2a_bench.experiments.throughput.metrics import (
     BIN,
     ENGINE_METRIC,
@@ -58,12 +54,11 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def throughput_sentences(cells: ThroughputCells) -> list[str]:
-    sentences = []
-    for cell in cells:
-        if rates := summary_of(cell.values(ENGINE_METRIC)):
-            source = "the engine's own figure" if cell.has_engine_time else "as the client saw it"
-            times = span_of([rates.n], "request")
-            sentences.append(f"{cell.name}: {mean_sd(rates)} tokens/s (mean ± sd of {times}, {source}).")
+    sentences = [
+        f"{cell.name}: {mean_sd(rates)} tokens/s, {'by its own figure' if cell.has_engine_time else 'at the client'}."
+        for cell in cells
+        if (rates := summary_of(cell.values(ENGINE_METRIC)))
+    ]
     sentences += [
         f"By their own figures the engine of {of} has {interval(ratio)} of the rate of {to}."
         for metric, of, to, ratio in cells.rate_ratios

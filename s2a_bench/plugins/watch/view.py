@@ -10,7 +10,7 @@ import pandas as pd
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import Cells, metrics_of
 from s2a_bench.plugins.watch.rows import EXCHANGES, ExchangeRow
-from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.figures import name_rows, new_figure
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.style import GROUP_FILLS, STALL_STYLE, WIDE_IN
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -28,7 +28,7 @@ PARTS: Final = {
     "server": ("#BBBBBB", ""),
     "inference": GROUP_FILLS["inference"],
     "download": GROUP_FILLS["return"],
-    "think": ("#F0E442", "...."),
+    "think": ("#F0E442", ".."),
 }
 """Parts of a cycle -> colour and hatch."""
 TRAVELS: Final = ("up_bytes", "down_bytes", "pieces", "horizon", "dim")
@@ -107,9 +107,8 @@ def build_cycles(cells: Exchanges, *, dry: bool) -> Figure:
     for place, name in enumerate(names):
         middle = max(0, len(lanes[name]) // 2 - CYCLES // 2)
         _draw_lane(axes, place, lanes[name][middle : middle + CYCLES])
-    axes.set_yticks(range(len(names)), names)
-    axes.set(xlabel="time (ms)", ylim=(len(names) - 0.4, -0.6))
-    axes.tick_params(axis="y", length=0)
+    name_rows(axes, names)
+    axes.set_xlabel("time (ms)")
     for part, (colour, hatch) in PARTS.items():
         axes.barh([-9], [0], color=colour, hatch=hatch, edgecolor="white", linewidth=0, label=part)
     if dry:

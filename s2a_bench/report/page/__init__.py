@@ -17,7 +17,7 @@ _HEAD_CHARS = 4096
 class ReportConfig(Options):
     """Runs, and the outputs about them; None writes no such output."""
 
-    runs: list[Path] = option(..., "run folders, or the folder of a sweep; several side by side", argument=True)
+    runs: list[Path] = option(..., "run folders, sweeps, or folders that hold some; side by side", argument=True)
     output: Path | None = option(None, "the page, one HTML file [default: report.html, if there is no other output]")
     latex: Path | None = option(None, "folder for LaTeX tables (booktabs) and figures as PDF")
     csv: Path | None = option(None, "folder for CSV tables with every digit")

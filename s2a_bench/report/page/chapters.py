@@ -1,4 +1,4 @@
-"""From run folders to chapters: one for a run; an overview and the runs of the cells for a sweep.
+"""From folders to chapters: one for a run; an overview and the runs of the cells for a sweep.
 
 Computed timelines of a sweep are combined into one run. Measured cells stay separate runs, since machines and moments
 differ.
@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments import Shown, Tables, experiment_of
 from s2a_bench.experiments.latency.view import against_bytes
 from s2a_bench.experiments.requests import RequestCell, RequestCells, cells_of, metric_phrase, stand_ins
@@ -22,6 +23,7 @@ from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.compare.agreement import SETTING, Difference, differences, differing_names, is_other_machine
 from s2a_bench.stats import Floats
+from s2a_bench.store.manifest import NAME as MANIFEST
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
@@ -31,6 +33,8 @@ from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
 
 MOST_CHAPTERS = 12
 """Runs of a sweep that have a chapter; the others are in the overview only."""
+MOST_RUNS = 200
+"""Runs of a folder that are shown."""
 _AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills", "t_nom_s")
 """Options that may differ between combined timelines; they are in the name of a timeline's cell."""
 Runs = Sequence[tuple[dict[str, Any], StoredRun]]
@@ -54,9 +58,34 @@ class Chapter:
         """Return the caveats, and what could not be built so far; figures are built last."""
         return [*self.caveats, *(f"Not shown: {failure}." for failure in self.content.failures)]
 
-    @property
-    def manifest(self) -> dict[str, Any]:
-        return self.run.manifest
+
+def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the run folders that paths name or hold, those of one folder by their start, and what is left out.
+
+    Raises UsageError if there is no run, StoreError for a path that does not exist.
+    """
+    folders: list[Path] = []
+    lines: list[str] = []
+    for path in paths:
+        if (path / MANIFEST).exists() or not path.exists():
+            folders.append(path)
+            continue
+        held = []
+        for entry in sorted(path.iterdir()) if path.is_dir() else ():
+            try:
+                held.append((str(read_run(entry).manifest.get("started")), entry))
+            except StoreError as error:
+                lines.append(f"skipped: {str(error).partition(': ')[0]}")
+        if not held:
+            lines.append(f"skipped: {path} is no run folder, and holds none")
+        if len(held) > MOST_RUNS:
+            lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
+        folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
+    if not folders:
+        holder = next((f", as {each.parents[1]}" for path in paths for each in path.glob(f"*/*/{MANIFEST}")), "")
+        named = ", ".join(map(str, paths))
+        raise UsageError(f"no run folder: {named}; name run folders, or a folder that holds some{holder}")
+    return folders, lines
 
 
 def read_chapters(paths: Sequence[Path], *, against: str = "") -> list[Chapter]:
@@ -90,19 +119,21 @@ def repeat_command(manifest: Mapping[str, Any]) -> str:
 
 def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     """Return a line for each run of another machine than the first, and one line of all other differences."""
-    lines: list[str] = []
+    unlike: dict[str, list[str]] = {}
     others: list[Difference] = []
     of_command: dict[str, StoredRun] = {}
     for chapter in chapters:
-        same = of_command.setdefault(str(chapter.manifest["command"]), chapter.run)
+        same = of_command.setdefault(str(chapter.run.manifest["command"]), chapter.run)
         every = differences(chapters[0].run, chapter.run)
         others += [each for each in every if not each.what.startswith(SETTING)]
         others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
         if what := "; ".join(str(each) for each in every if is_other_machine(each)):
-            lines.append(
-                f"{chapter.title} ran on another machine than {chapters[0].title} ({what}): "
-                "their numbers are side by side, and none combines both."
-            )
+            unlike.setdefault(what, []).append(chapter.title)
+    lines = [
+        f"{', '.join(titles[:1])}{f' and {len(titles) - 1} more' if len(titles) > 1 else ''} ran on another machine "
+        f"than {chapters[0].title} ({what}): their numbers are side by side, and none combines both."
+        for what, titles in unlike.items()
+    ]
     names = differing_names(others)
     return [*lines, f"The runs differ in {names}."] if names else lines
 
@@ -147,8 +178,10 @@ def _sweep(sweep: Sweep, against: str) -> Iterator[Chapter]:
     for place, run in enumerate(pools, 1):
         what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")
         yield _chapter(run, what, against, command=command)
+    varied = {name for settings, _ in single for name in settings if settings[name] != single[0][0].get(name)}
     for settings, run in single[:MOST_CHAPTERS]:
-        yield _chapter(run, f"{run.manifest['command']}: {settings_text(settings)}", against)
+        own = {name: value for name, value in settings.items() if name in varied or not varied}
+        yield _chapter(run, f"{run.manifest['command']}: {settings_text(own)} ({run.path.name})", against)
 
 
 def content_of(run: StoredRun, against: str) -> Shown:
@@ -172,14 +205,14 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
             f"{failed} failed; the table of cells has the errors, --resume --retry-failed runs them again."
         )
     cells = [cells_of(run) for _, run in runs]
-    lines, figures = against_bytes.shown(cells)
+    findings, lines, figures = against_bytes.shown(cells)
     measured = partial(measured_table, [settings for settings, _ in runs], cells)
     builders: Tables = {**lines, "overview": measured, "cells": partial(cell_table, sweep)}
     shown = Shown.build(builders, [*lines, "overview"], csvs=lambda: {"cells.csv": CsvTable.of_frame(sweep.cells)})
     line = sweep.origins.line
     tables = {name: replace(table, provenance=line) for name, table in shown.tables.items()}
     drawn = {name: partial(marked, build, *(run for _, run in runs)) for name, build in figures.items()}
-    return replace(shown, sentences=sentences, tables=tables, figures=drawn)
+    return replace(shown, sentences=[*findings, *sentences], tables=tables, figures=drawn)
 
 
 def cell_table(sweep: Sweep) -> TextTable:

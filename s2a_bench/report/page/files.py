@@ -6,24 +6,23 @@ import io
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments import Shown
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.page import GENERATOR, ReportConfig
-from s2a_bench.report.page.chapters import Chapter, differences_of, when
+from s2a_bench.report.page.chapters import Chapter, differences_of
 from s2a_bench.report.verdicts import Verdicts, judge
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.run import fits
-from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import document, escape, to_float
-from s2a_bench.writers.style import WIDTH_IN, paper_column
+from s2a_bench.writers.style import PAGE_IN, WIDTH_IN, paper_column
 from s2a_bench.writers.tables import Note, markdown_text, to_markdown
 
 if TYPE_CHECKING:
@@ -32,37 +31,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DrawnFigure:
-    """One figure as SVG for HTML, and as PDF if that is an output.
+    """One figure as SVG for HTML, the first also of the width of a page, and as PDF if that is an output.
 
     ``title`` and ``notes`` are its caption; a ``wide`` one spans both columns of a paper.
     """
 
-    svg: str
+    svgs: Sequence[str]
     title: str
     notes: Sequence[str]
     wide: bool
     pdf: bytes | None
 
 
-def draw(name: str, content: Shown, *, pdf: bool) -> dict[str, DrawnFigure]:
-    """Build each figure once; ``name`` makes its ids differ from those of other figures."""
+def draw(chapter: Chapter, *, pdf: bool) -> dict[str, DrawnFigure]:
+    """Build each figure, the first in two widths; its SVG has no line of provenance, as the page labels it."""
     import matplotlib as mpl
 
     drawn = {}
-    for place, (figure_name, build) in enumerate(content.figures.items()):
-        prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', name)}-{place}-"
-        style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
-        with content.noted(f"figure {figure_name}"), paper_column(), mpl.rc_context(style):
-            figure = build()
+    for place, (name, build) in enumerate(chapter.content.figures.items()):
+        svgs: list[str] = []
+        with chapter.content.noted(f"figure {name}"):
+            for width_in in (WIDTH_IN,) if place else (PAGE_IN, WIDTH_IN):
+                prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', chapter.name)}-{place}-{len(svgs)}-"
+                style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
+                with paper_column(width_in), mpl.rc_context(style):
+                    figure = build()
+                    as_pdf = _saved(figure, "pdf", "CreationDate") if pdf and width_in == WIDTH_IN else None
+                    figure.suptitle("").set_in_layout(False)
+                    svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
+                svgs.append(inline(svg[svg.index("<svg") :], prefix))
             title, *notes = caption_of(figure)
-            svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
-            drawn[figure_name] = DrawnFigure(
-                inline(svg[svg.index("<svg") :], prefix),
-                title,
-                notes,
-                figure.get_figwidth() > WIDTH_IN,
-                _saved(figure, "pdf", "CreationDate") if pdf else None,
-            )
+            drawn[name] = DrawnFigure(svgs, title, notes, figure.get_figwidth() > WIDTH_IN, as_pdf)
     return drawn
 
 
@@ -73,9 +72,13 @@ def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
 
 
 def inline(svg: str, prefix: str) -> str:
-    """Prepare an SVG for HTML: no namespaces, metadata and styles (they would apply to the page), unique ids."""
+    """Prepare an SVG for HTML: no namespaces, metadata and styles (they would apply to the page), unique ids.
+
+    Paths keep two decimals.
+    """
     svg = re.sub(r"<!--.*?-->\s*|<(metadata|style)\b.*?</\1>\s*", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
+    svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"\s*\n|(?<=\.\d\d)\d+", "", path[0]), svg)
     svg = svg.replace("xlink:href=", "href=")
     return re.sub(r'(\bid="|href="#|url\(#)', lambda match: match[1] + prefix, svg)
 
@@ -109,7 +112,7 @@ def make_report(chapters: Sequence[Chapter], *, against: str = "") -> Report:
 def write_report(report: Report, config: ReportConfig) -> list[Path]:
     """Write the outputs and return their files; raises StoreError."""
     drawn = {
-        chapter.name: draw(chapter.name, chapter.content, pdf=config.latex is not None)
+        chapter.name: draw(chapter, pdf=config.latex is not None)
         for chapter in report.chapters
         if config.page or config.latex
     }
@@ -181,6 +184,8 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
     """Return the page, one HTML file that fetches nothing; every text of a run is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    paths = {chapter.run.path for chapter in report.chapters}
+    folders = [path for path in paths if paths.isdisjoint(path.parents)]  # a sweep's holds those of its runs
     loader = PackageLoader("s2a_bench.report.page", "templates")
     world = Environment(
         loader=loader,
@@ -191,6 +196,7 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         lstrip_blocks=True,
     )
     world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
+    world.tests["long"] = lambda text: len(text) > 80  # noqa: PLR2004 - two lines on a phone
     world.filters["short"] = lambda value: f"{value:.6g}"
     return world.get_template("page.html").render(
         generator=GENERATOR,
@@ -198,47 +204,24 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
         made=utc_now().replace("T", " ").replace("+00:00", " UTC"),
         style=loader.get_source(world, "page.css")[0],
         script=loader.get_source(world, "page.js")[0],
-        title=title_of_page(report.chapters),
-        chapters=[(chapter, _view(chapter), drawn.get(chapter.name, {})) for chapter in report.chapters],
+        title=report.chapters[0].title if len(folders) == 1 else f"{len(folders)} runs, side by side",
+        chapters=[(chapter, _view(chapter, [*drawn.get(chapter.name, {}).values()])) for chapter in report.chapters],
         judged=report.judged,
         caveats=report.caveats,
     )
 
 
-def title_of_page(chapters: Sequence[Chapter]) -> str:
-    """Return the title of the only folder, or the number of folders; a sweep's chapters count as one."""
-    sweeps = {chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)}
-    folders = [chapter for chapter in chapters if sweeps.isdisjoint(chapter.run.path.parents)]
-    names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
-    return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
-
-
-def _view(chapter: Chapter) -> dict[str, Any]:
-    """Return what the page shows of a chapter besides its fields."""
-    content, manifest = chapter.content, chapter.manifest
-    notes = [note for table in content.tables.values() for note in table.notes if isinstance(note, Note)]
+def _view(chapter: Chapter, figures: Sequence[DrawnFigure]) -> dict[str, Any]:
+    """Return what the page shows of a chapter besides its fields; ``about`` are the notes that open items share."""
+    tables = chapter.content.tables
+    notes = [note for table in tables.values() for note in table.notes if isinstance(note, Note)]
     labels = [label for note in notes for label in note.labels]
+    opened = [table for name, table in tables.items() if name in chapter.content.main]
+    noted = [*(table.notes for table in opened), *(figure.notes for figure in figures[:1])]
     return {
         "id": "run-" + re.sub(r"[^A-Za-z0-9_-]", "-", chapter.name),
-        "started": when(manifest),
-        "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels))),
-        "more": [table for name, table in content.tables.items() if name not in content.main],
-        "facts": {
-            "Environment": _facts(manifest.get("environment", {})),
-            "Model": _facts(manifest.get("model") or {}),
-            "Configuration": _facts(manifest.get("configuration", {})),
-            "Seeds": _facts(manifest.get("seeds", {})),
-            "Facts of a request": [(name, fact["about"]) for name, fact in chapter.run.facts.items()],
-        },
+        "labels": [*dict.fromkeys((*chapter.run.origins.labels, *labels))],
+        "about": [note for note in dict.fromkeys(chain(*noted)) if sum(note in notes for notes in noted) > 1],
+        "figures": figures,
+        "opened": opened,
     }
-
-
-def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(facts, list) and any(isinstance(each, dict) for each in facts):
-        facts = dict(enumerate(facts))
-    if isinstance(facts, dict):
-        return [line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}".removeprefix("."))]
-    if facts is None or facts in ("", []):
-        return []
-    text = ", ".join(map(str, facts)) if isinstance(facts, list) else str(facts)
-    return [(prefix, text)]

@@ -30,7 +30,7 @@ FIGURES = {
     "ccrb": ("scenario", "phase"),
     "chunks": ("lanes", "stability", "triggers", "reactions"),
     "task": ("task",),
-    "latency": ("latency_bars", "stages", "distribution"),
+    "latency": ("stages", "latency_bars", "distribution"),
     "throughput": ("throughput_bars", "gaps", "positions"),
     "timeline": ("timeline",),
     "watch": ("cycles",),

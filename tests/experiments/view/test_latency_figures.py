@@ -15,7 +15,7 @@ from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.figures import Bar, caption_of
-from s2a_bench.writers.style import GREY, paper_column
+from s2a_bench.writers.style import GREY, PAGE_IN, paper_column
 from tests.made_runs import MakeRun
 
 HAND = {
@@ -94,6 +94,10 @@ def test_cells_that_differ_widely_get_a_panel_of_shares(make_run: MakeRun) -> No
     assert ends == pytest.approx([100, 100, 100])
     capture = [bar.get_width() for bar in bars(figure, 1)][::6]
     assert capture == pytest.approx([12.5, 25, 50])
+    with paper_column(PAGE_IN):
+        beside = drawn("stages", make_run(HAND | small, n=4, spread=0))
+    assert beside.axes[0].get_position().y0 == beside.axes[1].get_position().y0
+    assert row_names(beside)[0] == "http/as-deployed (raw)"
 
 
 def test_a_black_box_is_left_out_by_name_or_shown_with_its_inference(make_run: MakeRun, black_box: Any) -> None:
@@ -126,7 +130,7 @@ def test_figures_are_written_with_their_captions_and_leave_no_global_state(make_
     write_shown(run, EXPERIMENT.show(run, against="paper"))
     assert dict(mpl.rcParams) == before
     (captions,) = (run.path / "figures").glob("*.md")
-    assert captions.read_text().startswith("**latency_bars**: Medians: end to end without inference. n = 3 a cell")
+    assert captions.read_text().startswith("**stages**: Stages, medians: end to end without inference. n = 3 a cell")
 
 
 def test_only_views_writers_and_report_import_matplotlib() -> None:

@@ -20,7 +20,7 @@ from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.trace import path_of
 from s2a_bench.writers.latex import to_latex
-from s2a_bench.writers.tables import interval, mean_sd, number, to_markdown
+from s2a_bench.writers.tables import TextTable, interval, mean_sd, number, to_markdown
 from tests.made_runs import STAGES, MakeRun, known
 
 NONE = "\N{EN DASH}"
@@ -39,12 +39,17 @@ def printed(run: StoredRun, width: int = 100) -> str:
     return out.getvalue()
 
 
+def medians(table: TextTable) -> list[tuple[str, ...]]:
+    """Return the rows of a table without the mean ± sd in brackets."""
+    return [tuple(text.partition(" (")[0] for text in row) for row in table.rows]
+
+
 def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> None:
     ours = {"capture": 1, "network": 3, "preprocess": 20, "inference": 80, "return": 0.5}
     theirs = {"capture": 1, "json_pack": 2, "ingest": 30, "inference": 81}
     cells = {"http/llama-server": theirs, "ros/topic": ours}
     run = make_run(cells, n=4, spread=0, manifest={"stages": path_of([STAGES])}, server_prompt_ms=80.0)
-    assert stage_table(cells_of(run), full=False).rows[-5:] == [
+    assert medians(stage_table(cells_of(run)))[-5:] == [
         ("", "e2e without inference", "33.0", "4.50"),
         ("", "preprocess", NONE, "20.0"),
         ("", "e2e without model", "34.0", "24.5"),
@@ -53,7 +58,8 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
     ]
     assert group_table(cells_of(run)).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
     assert "e2e less the prompt_ms it reports, which is assumed to be all" in " ".join(printed(run).split())
-    assert show(run).sentences[-1].startswith("Without model, http/llama-server takes 1.39 times as long as ros/topic")
+    (sentence,) = show(run).sentences
+    assert sentence == "Without model, http/llama-server takes 1.39 times as long as ros/topic (raw)."
 
 
 @pytest.mark.parametrize(
@@ -87,9 +93,9 @@ def test_a_ratio_without_bounds_or_value_says_so() -> None:
 
 
 def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
-    table = stage_table(cells_of(make_run(HAND, n=4, spread=0)), full=False)
+    table = stage_table(cells_of(make_run(HAND, n=4, spread=0)))
     assert table.header == ("group", "stage", "http/as-deployed", "ros/topic")
-    assert table.rows == [
+    assert medians(table) == [
         ("capture", "capture", "1.00", "1.00"),
         ("encode", "image_encode", "3.00", NONE),
         ("", "base64_encode", "2.00", NONE),
@@ -103,11 +109,11 @@ def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
     ]
     assert table.notes == (
         "n = 4 samples a cell, warm-ups left out.",
-        "640x480; payload: raw.",
+        "640x480; payload: raw; request mode.",
         "Echo engine.",
         "4 of 8 samples have a residual above 5% of e2e without inference.",
     )
-    assert stage_table(cells_of(make_run(HAND, n=4, spread=0))).rows[1][2] == "3.00 (3.00 ± 0.00)"
+    assert table.rows[1][2] == "3.00 (3.00 ± 0.00)"
 
 
 def test_the_group_table_has_a_row_a_cell(make_run: MakeRun) -> None:
@@ -157,19 +163,32 @@ def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> N
         *("http/as-deployed raw", "ros/topic raw"),
         *("http/as-deployed jpeg", "ros/topic jpeg"),
     )
-    first, *medians, one, other = show(run).sentences
-    assert "over http/as-deployed, ros/topic; raw and jpeg frames of 640x480" in first
-    assert medians[1].startswith("End to end without inference with jpeg pictures, medians: http/as-deployed 10.0 ms")
-    assert one.startswith("http/as-deployed takes 5.76 times as long as ros/topic with raw pictures")
-    assert other.startswith("http/as-deployed takes 2.00 times as long as ros/topic with jpeg pictures")
+    assert show(run).sentences == [
+        f"Without inference, http/as-deployed takes {times} times as long as ros/topic ({payload})."
+        for times, payload in (("5.76", "raw"), ("2.00", "jpeg"))
+    ]
+
+
+def test_a_sentence_says_what_takes_longer_and_where_no_difference_is_shown(make_run: MakeRun) -> None:
+    in_process = {"loopback": {"capture": 1, "inference": 100, "return": 0.3}}
+    sentence, launch = show(make_run(HAND | {"http/binary": HAND["ros/topic"]} | in_process, n=5, spread=0)).sentences
+    assert sentence == (
+        "Without inference, http/as-deployed takes 5.76 [95 %: 5.76, 5.76] times as long as ros/topic (raw); "
+        "no difference is shown for http/binary 1.00 [1.00, 1.00]."
+    )
+    assert launch.startswith("The intervals hold for this launch only")
+    alone = dict.fromkeys(("http/binary", "ros/topic"), HAND["ros/topic"])
+    (none, _) = show(make_run(alone, n=5, spread=0)).sentences
+    assert none.startswith("Without inference, no difference from ros/topic (raw) is shown for http/binary")
+    assert "as long as loopback" in show(make_run(in_process | {"ros/topic": HAND["ros/topic"]}, n=5)).sentences[0]
 
 
 @pytest.mark.parametrize("named", [True, False])
 def test_unlike_payloads_are_compared_where_a_name_has_its_payload(make_run: MakeRun, named: bool) -> None:
     names = ("http?payload=jpeg", "ros") if named else ("http", "ros")
     run = make_run(HAND, n=4, spread=0, payloads={"http": "jpeg"}, manifest={"configuration": {"transports": names}})
-    sentence_start = "http/as-deployed with jpeg pictures takes 5.76 times as long as ros/topic with raw pictures"
-    assert any(sentence.startswith(sentence_start) for sentence in show(run).sentences) is named
+    said = "http/as-deployed (jpeg) takes 5.76 times as long as ros/topic (raw)"
+    assert any(said in sentence for sentence in show(run).sentences) is named
     assert any("ratio" in name for name in summary_table(cells_of(run)).header) is named
 
 
@@ -263,14 +282,13 @@ def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
     run = make_run(cells, n=8)
     text = printed(run, width)
     assert "…" not in text
-    tables, _, sentences = text.partition("8 requests a cell")
-    assert all(len(line.rstrip()) <= width for line in tables.splitlines())
-    assert {
-        row[-1] for row in (group_table(cells_of(run)) if count > 5 else stage_table(cells_of(run), full=False)).rows
-    } <= {*tables.split()}
-    assert "Echo engine." in " ".join(sentences.split())
-    assert "mean ± sd" not in tables or count < 3
-    assert "more tables (summary, summary-e2e" in sentences
+    shown, _, rest = text.partition("more tables (summary, summary-e2e")
+    assert all(len(line.rstrip()) <= width for line in shown.splitlines())
+    rows = (group_table(cells_of(run)) if count > 2 else stage_table(cells_of(run))).rows
+    assert {word for row in rows for word in row[-1].split()} <= {*shown.split()}
+    assert "Echo engine." in " ".join(shown.split())
+    assert ("mean ± sd" in shown) is (count < 3)
+    assert "--verbose prints them" in rest
 
 
 def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:

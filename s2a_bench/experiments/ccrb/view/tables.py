@@ -47,11 +47,11 @@ def show(run: StoredRun, **_: Any) -> Shown:
     return Shown.build(
         sentences=partial(_sentences, rollouts),
         tables={
-            "random": partial(_random_table, rollouts),
-            "phase": partial(_phase_table, rollouts),
-            "margins": lambda: _margin_table(rollouts.point),
-            "stages": partial(_stage_table, rollouts),
             "outcomes": partial(_outcome_table, rollouts),
+            "stages": partial(_stage_table, rollouts),
+            "phase": partial(_phase_table, rollouts),
+            "random": partial(_random_table, rollouts),
+            "margins": lambda: _margin_table(rollouts.point),
         },
         main=["outcomes", "stages", "phase", "random"],
         csvs=lambda: {"orderings.csv": _ordering_csv(rollouts.studies)},
@@ -66,9 +66,6 @@ def _sentences(rollouts: Rollouts) -> list[str]:
     ]
     for gap, scenes in rollouts.studies.get("phase", {}).items():
         sentences.append(f"Phase diagram, gap behaviour {finding(gap, scenes, rollouts.settings['rear_gap_m'])}")
-    if studies := rollouts.run.manifest.get("studies"):
-        speed = studies["rollouts_per_cpu_s"]
-        sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
     return sentences
 
 

@@ -30,9 +30,7 @@ from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
 
-_STAGE_CELLS = 5
-"""With more cells than this a narrow table has the cells as rows."""
-_MOST = 6
+_MOST_SENTENCES = 4
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
@@ -41,10 +39,10 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: _latency_sentences(cells),
         tables={
-            "stages": lambda: stage_table(cells),
             "summary": lambda: summary_table(cells),
             "summary-e2e": lambda: summary_table(cells, "e2e"),
             "summary-model": lambda: summary_table(cells, "e2e_without_model") if modelled else None,
+            "stages": lambda: stage_table(cells),
             "tokens": lambda: _token_table(cells),
             "frames": lambda: _frame_table(cells),
             "facts": lambda: fact_table(cells),
@@ -57,45 +55,38 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def _latency_sentences(cells: RequestCells) -> list[str]:
-    if not cells:
-        return []
-    mode = cells[0].about["mode"]
-    names = ", ".join(dict.fromkeys(cell.label for cell in cells))
-    requests = span_of((cell.n for cell in cells), "request")
-    pictures = " ".join((" and ".join(cells.payloads), "frames")).lstrip()
-    sentences = [f"{requests} a cell over {names}; {pictures} of {cells.observation}, {mode} mode."]
+    """Return how many times as long cells take as another, in process if there is no other: a sentence for each."""
     metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
-    for payload in dict.fromkeys(cell.payload for cell in cells):
-        medians = [
-            f"{cell.label} {number(middle.median)} ms"
-            for cell in cells
-            if cell.payload == payload and (middle := summary_of(cell.values(metric)))
-        ]
-        if medians:
-            sentences.append(f"{metric_phrase(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
-    wired = [each for each in cells.ratios if not declared_transport(each[2].pipeline).in_process]
-    times = [_times(cell, base, ratio) for of, cell, base, ratio in wired if of == metric]
-    beside = [
-        f"Without model, {_times(cell, base, ratio)}"
-        for of, cell, base, ratio in wired
-        if of == "e2e_without_model" and cell.has_ingest
+    by_base: dict[tuple[bool, str, str], list[tuple[RequestCell, RequestCell, Ratio]]] = {}
+    for of, cell, base, ratio in cells.ratios:
+        if ratio.value is not None and (of == metric or (of == "e2e_without_model" and cell.has_ingest)):
+            key = declared_transport(base.pipeline).in_process, of, base.name
+            by_base.setdefault(key, []).append((cell, base, ratio))
+    wired = {key: pairs for key, pairs in by_base.items() if not key[0]} or by_base
+    sentences = [
+        f"{of.replace('_', ' ').removeprefix('e2e ').capitalize()}, {_difference(pairs)}"
+        for (_, of, _), pairs in wired.items()
     ]
-    return sentences + times[:_MOST] + beside[:_MOST]
+    return [*sentences[:_MOST_SENTENCES], *launches_note(ratio for pairs in wired.values() for *_, ratio in pairs)]
+
+
+def _difference(pairs: Sequence[tuple[RequestCell, RequestCell, Ratio]]) -> str:
+    """Say how many times as long cells take as their base; an interval that holds 1 shows no difference."""
+    cell, base, _ = pairs[0]
+    than = f"{base.label}{_of(base.payload or cell.payload)}"
+    differ: list[str] = []
+    same: list[str] = []
+    for cell, _, ratio in sorted(pairs, key=lambda pair: -(pair[2].value or 0)):
+        name = cell.label + ("" if cell.payload == base.payload else _of(cell.payload))
+        is_same = ratio.ci95 and ratio.ci95[0] <= 1 <= ratio.ci95[1]
+        times = "" if differ or is_same else f" times as long as {than}"
+        (same if is_same else differ).append(f"{name}{' takes' if times else ''} {interval(ratio)}{times}")
+    none = f"no difference {'' if differ else f'from {than} '}is shown for {', '.join(same)}" if same else ""
+    return f"{'; '.join(filter(None, (', '.join(differ), none)))}.".replace("[", "[95 %: ", 1)
 
 
 def _of(payload: str) -> str:
-    return f" with {payload} pictures" if payload else ""
-
-
-def _times(cell: RequestCell, base: RequestCell, ratio: Ratio) -> str:
-    between = ""
-    if ratio.low is not None and ratio.high is not None:
-        over = f"over {ratio.launches} launches" if ratio.launches > 1 else "of one launch"
-        bounds = interval(ratio).partition(" ")[2][1:-1].replace(",", " to")
-        between = f" (ratio of medians {over}, 95 % interval {bounds})"
-    value = "an unknown number of" if ratio.value is None else number(ratio.value)
-    of = "" if cell.payload == base.payload else _of(cell.payload)
-    return f"{cell.label}{of} takes {value} times as long as {base.label}{_of(base.payload or cell.payload)}{between}."
+    return f" ({payload})" if payload else ""
 
 
 _FOOT = ("residual", "round_trip", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
@@ -108,8 +99,8 @@ _FRAME_FOOT = {
 }
 
 
-def stage_table(cells: RequestCells, *, full: bool = True) -> TextTable:
-    """Return the table of the stages in path order, a column a cell: the median, and mean ± sd if ``full``.
+def stage_table(cells: RequestCells) -> TextTable:
+    """Return the table of the stages in path order, a column a cell; the brief one has the cells as rows.
 
     Inference is below the residual, so that e2e without inference reads as one sum, and so do the rows below it.
     """
@@ -117,22 +108,18 @@ def stage_table(cells: RequestCells, *, full: bool = True) -> TextTable:
     last = ""
     for stage in cells.stages:
         if (group := cells.run.stages[stage]) != "inference":
-            rows.append(("" if group == last else group, stage, *(_entry(cell, stage, full=full) for cell in cells)))
+            rows.append(("" if group == last else group, stage, *(_entry(cell, stage, full=True) for cell in cells)))
             last = group
     below = len(rows)
     rows += [
-        ("", metric.replace("_", " "), *(_entry(cell, metric, full=full) for cell in cells)) for metric in _foot(cells)
+        ("", metric.replace("_", " "), *(_entry(cell, metric, full=True) for cell in cells)) for metric in _foot(cells)
     ]
-    title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
-    header = ("group", "stage", *cells.titles)
-    brief = None
-    if full:
-        brief = group_table(cells) if len(cells) > _STAGE_CELLS else stage_table(cells, full=False)
-    return TextTable(title, header, rows, 2, frozenset({below + 1}), _notes(cells), brief=brief)
+    title, header = "Stages in ms: median (mean ± sd)", ("group", "stage", *cells.titles)
+    return TextTable(title, header, rows, 2, frozenset({below + 1}), _notes(cells), brief=group_table(cells))
 
 
 def group_table(cells: RequestCells) -> TextTable:
-    """Return a table with groups as columns and cells as rows, for runs of many cells."""
+    """Return a table with groups as columns and cells as rows."""
     groups = [group for group in cells.groups if group != "inference"]
     foot = _foot(cells)[1:]
     columns = [*(f"{GROUP}{group}" for group in groups), *foot]
@@ -231,7 +218,8 @@ def _notes(cells: RequestCells) -> tuple[str, ...]:
     counts = span_of(cell.n for cell in cells)
     notes = [f"n = {counts} samples a cell, warm-ups left out." if counts else "No samples."]
     if cells:
-        notes.append(f"{cells.observation}; payload: {', '.join(cells.payloads) or 'none'}.")
+        mode = cells[0].about["mode"]
+        notes.append(f"{cells.observation}; payload: {', '.join(cells.payloads) or 'none'}; {mode} mode.")
     if shape := cells.action_shape:
         notes.append(f"Each answer is a chunk of {shape} numbers, not tokens.")
     notes += cells.engine_notes

@@ -6,7 +6,7 @@ so that lines can cross; the share on the wire is another column. Loopback's lin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,7 +20,7 @@ from s2a_bench.stats.batches import Blocks
 from s2a_bench.stats.change import FEWEST_LAUNCHES, ratio_of_launches
 from s2a_bench.stats.line import Estimate, Line, fit_line
 from s2a_bench.transport import declared_transport, payload_order
-from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.figures import new_figure, on_page
 from s2a_bench.writers.style import cell_styles
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, number
 
@@ -195,16 +195,19 @@ def _build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -
     payloads = list(dict.fromkeys(each.payload for each in drawn))
     names = {each.name: each.path for each in drawn}
     styles = cell_styles(names)
-    height = 0.6 + 2.3 * len(payloads) + 0.14 * -(-len(names) // 2)
+    beside = on_page()
+    rows, columns = (1, 4) if beside else (len(payloads), 2)
+    height = 0.6 + (3 if beside else 2.3) * rows + 0.14 * -(-len(names) // columns)
     figure = new_figure(height, ("Time against bytes: medians and fitted lines", *answered))
-    panels = figure.subplots(len(payloads), 1, squeeze=False, sharex=True)[:, 0]
+    panels = figure.subplots(rows, len(payloads) // rows, squeeze=False, sharex=True, sharey=beside).ravel()
     for axes, payload in zip(panels, payloads, strict=True):
         _draw(axes, [each for each in drawn if each.payload == payload], styles)
         axes.set_title(f"payload {payload}", loc="left")
         axes.set_ylabel("e2e without inference (ms)")
-    panels[-1].set_xlabel("pictures of a request, as pixels (MB)")
+        axes.set_xlabel("pictures of a request, as pixels (MB)")
+        axes.label_outer()
     handles = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, columnspacing=1.2)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, columnspacing=1.2)
     return figure
 
 
@@ -230,14 +233,25 @@ def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, 
     axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
 
 
-def shown(runs: Sequence[RequestCells]) -> tuple[Tables, dict[str, Callable[[], Figure]]]:
-    """Return what builds the tables and the figure of runs with pictures of different sizes, by their files' names."""
+def _sentences(pipelines: Sequence[FittedPipeline]) -> Iterator[str]:
+    """Yield over which pipelines a megabyte takes least and longest, for each payload."""
+    slopes: dict[str, list[tuple[float, str]]] = {}
+    for each in pipelines:
+        if each.line and not declared_transport(each.path[0]).in_process:
+            text = f"{_estimate(each.line.slope)} ms over {each.name}"
+            slopes.setdefault(each.payload, []).append((each.line.slope.value, text))
+    for payload, costs in slopes.items():
+        yield f"With {payload} pictures a megabyte of pixels takes {min(costs)[1]} to {max(costs)[1]}."
+
+
+def shown(runs: Sequence[RequestCells]) -> tuple[list[str], Tables, dict[str, Callable[[], Figure]]]:
+    """Return sentences, and what builds tables and a figure, of runs with pictures of different sizes, by file name."""
     pipelines = against_bytes(runs)
     if not pipelines:
-        return {}, {}
+        return [], {}, {}
     answered = stand_ins(runs)
     tables: Tables = {
         "bytes": lambda: line_table(pipelines, answered),
         "crossings": lambda: _order_table(pipelines, answered),
     }
-    return tables, {"time_against_bytes": lambda: _build_lines(pipelines, answered)}
+    return [*_sentences(pipelines)], tables, {"time_against_bytes": lambda: _build_lines(pipelines, answered)}

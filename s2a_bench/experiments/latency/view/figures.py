@@ -20,6 +20,7 @@ from s2a_bench.writers.figures import (
     draw_over,
     name_rows,
     new_figure,
+    on_page,
     write_beside,
 )
 from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, cell_styles
@@ -66,7 +67,7 @@ def latency_figures(cells: RequestCells, against: str = "") -> dict[str, Callabl
         return build_distribution(caption("Distribution"), lines, "samples", label)
 
     around = chain.from_iterable(figures(cells.run).items() for figures in shown("figures"))
-    return {"latency_bars": medians, "stages": stages, "distribution": distribution, **dict(around)}
+    return {"stages": stages, "latency_bars": medians, "distribution": distribution, **dict(around)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +128,11 @@ def build_stage_breakdown(caption: Sequence[str], bars: Sequence[StageBar], labe
     from matplotlib.patches import Patch
 
     fills = {name: RESIDUAL_FILL if name == RESIDUAL else GROUP_FILLS[name] for name in bars[0].parts}
+    beside = on_page()
     panels = 2 if _differ(bars) else 1
-    legend_rows = -(-(len(fills) + 1) // 4)
-    figure = new_figure(0.85 + panels * (0.3 + 0.34 * len(bars)) + 0.16 * legend_rows, caption)
-    times, *shares = figure.subplots(panels, 1, squeeze=False)[:, 0]
+    rows, legend_rows, row_in = (1, 1, 0.26) if beside else (panels, -(-(len(fills) + 1) // 4), 0.34)
+    figure = new_figure(0.85 + rows * (0.3 + row_in * len(bars)) + 0.16 * legend_rows, caption)
+    times, *shares = figure.subplots(rows, panels // rows, squeeze=False).flat
     for place, bar in enumerate(bars):
         _draw_stages(times, place, bar, fills, 1.0)
         left = 0.0
@@ -149,14 +151,14 @@ def build_stage_breakdown(caption: Sequence[str], bars: Sequence[StageBar], labe
         axes.set_xlim(0, 100)
         axes.set_xlabel("share (%)")
     for axes in (times, *shares):
-        name_rows(axes, [bar.label for bar in bars])
+        name_rows(axes, [bar.label.replace("\n?", "?").replace("\n", " ") if beside else bar.label for bar in bars])
+        axes.tick_params(labelleft=axes is times or not beside)
     handles: list[object] = [
         Patch(facecolor=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3, label=name)
         for name, (colour, hatch) in fills.items()
     ]
     handles += [line for line in times.get_lines() if line.get_label() == "whole"]
-    columns = -(-len(handles) // legend_rows)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, columnspacing=1.0)
+    figure.legend(handles=handles, loc="outside lower center", ncols=-(-len(handles) // legend_rows), columnspacing=1.0)
     return figure
 
 

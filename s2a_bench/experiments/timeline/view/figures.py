@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.timeline.view.cells import Panel, Timelines, panels, seconds
 from s2a_bench.policy import POLICIES
-from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.figures import new_figure, on_page
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
 from s2a_bench.writers.style import STALL_STYLE, WIDE_IN, WIDTH_IN, ink_on
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.requests import SkillRow
 
-_LEGEND_COLUMNS: Final = {WIDTH_IN: 3, WIDE_IN: 6}
 _OTHERS: Final = ("#56B4E9", "#CC79A7", "#D55E00", "#999999")
 _VISIBLE_NS: Final = 20_000_000
 """Shorter stalls and stretches are rounding or jitter, and too narrow to see."""
@@ -58,7 +57,7 @@ def build_timelines(cells: Sequence[Timelines], notes: Iterable[str]) -> Figure:
     places = {(panel.first.tokens_per_skill, panel.first.title): panel for panel in every}
     colours = policy_colours(cells)
     width_in = WIDTH_IN if len(titles) == 1 else WIDE_IN
-    columns = _LEGEND_COLUMNS[width_in]
+    columns = 3 if width_in == WIDTH_IN and not on_page() else 6
     n_skills, t_nom_s = cells[0].shape
     caption = f"Execution timelines: N = {n_skills} skills, T_nom = {t_nom_s:g} s{_of_plans(cells)}", *notes
     handles = _legend(cells)

@@ -8,7 +8,6 @@ from typing import Any
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import COUNT, FLAG, SHARE, TIME, Metric
-from s2a_bench.experiments.requests import span_of
 from s2a_bench.experiments.timeline.rows import METRICS
 from s2a_bench.experiments.timeline.view.cells import (
     Timelines,
@@ -47,22 +46,15 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 
 def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
-    by_policy: dict[str, list[Timelines]] = {}
-    for cell in cells:
-        by_policy.setdefault(cell.policy, []).append(cell)
-    settings = len({cell.setting for cell in cells})
-    plans = span_of(map(len, cells), "plan")
-    sentences = [f"{span_of([settings], 'setting')} of board and granularity, {plans} a policy in each."]
-    return sentences + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
+    policies = dict.fromkeys(cell.policy for cell in cells)
+    return [_policy_sentence(policy, [cell for cell in cells if cell.policy == policy]) for policy in policies]
 
 
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     stalling = [cell for cell in cells if cell.p_any_stall > 0]
-    starts = sorted(cell.mean("start_s") or 0.0 for cell in cells)
-    ends = sorted(cell.mean("end_s") or 0.0 for cell in cells)
-    moved = f"starts after {_span(starts)} s and ends after {_span(ends)} s"
+    late = f"it ends at most {max(cell.mean('end_regret') or 0.0 for cell in cells):.0%} late"
     if not stalling:
-        return f"{policy} never stalls; it {moved}."
+        return f"{policy} never stalls; {late}."
     worst = max(stalling, key=lambda cell: cell.stall_s)
     plans = len(worst)
     share = ""
@@ -71,12 +63,7 @@ def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
         share = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
     where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
     most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {worst.stall_s:.2f} s a plan"
-    return f"{policy} stalls in {where}, {most};{share} it {moved}."
-
-
-def _span(values: Sequence[float]) -> str:
-    low, high = f"{values[0]:.2f}", f"{values[-1]:.2f}"
-    return low if low == high else f"{low} to {high}"
+    return f"{policy} stalls in {where}, {most};{share} {late}."
 
 
 _EXECUTION = ("start_s", "end_s", "stalls", "stall_s", "longest_stall_s", "start_regret", "end_regret")

@@ -116,12 +116,13 @@ for (const panel of document.querySelectorAll(".panel")) {
     const button = document.createElement("button");
     button.type = "button";
     button.textContent = text;
-    button.setAttribute("aria-label", `${name}: ${panel.querySelector("figcaption").textContent}`);
+    button.setAttribute("aria-label", `${name}: ${panel.querySelector("figcaption b").textContent}`);
     button.addEventListener("click", act);
     buttons.append(button);
   }
   panel.append(buttons);
   svg.classList.add("zoomable");
+  draw();
 }
 
 // What is folded away is printed all the same.
