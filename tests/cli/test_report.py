@@ -56,7 +56,7 @@ def test_a_folder_is_all_runs_in_it_and_what_is_no_run_is_skipped(
     (folder / "notes").mkdir()
     for paths in ([folder], sorted(folder.iterdir())):
         skipped = called("report", *paths).stderr.splitlines()
-        assert [line.partition(" is no run folder")[0] for line in skipped] == [
+        assert [line.partition(" is not a run folder")[0] for line in skipped] == [
             f"skipped: {folder / name}" for name in ("README.md", "notes")
         ]
         page = Path("report.html").read_text()

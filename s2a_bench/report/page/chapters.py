@@ -77,7 +77,7 @@ def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
             except StoreError as error:
                 lines.append(f"skipped: {str(error).partition(': ')[0]}")
         if not held:
-            lines.append(f"skipped: {path} is no run folder, and holds none")
+            lines.append(f"skipped: {path} is not a run folder, and holds none")
         if len(held) > MOST_RUNS:
             lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
         folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
