@@ -52,18 +52,19 @@ def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
 
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     stalling = [cell for cell in cells if cell.p_any_stall > 0]
-    late = f"it ends at most {max(cell.mean('end_regret') or 0.0 for cell in cells):.0%} late"
+    share = max(cell.mean("end_regret") or 0.0 for cell in cells)
+    late = f"it ends up to {share:.0%} later than S0 allows" if share >= 0.005 else "it ends as early as S0 allows"
     if not stalling:
         return f"{policy} never stalls; {late}."
     worst = max(stalling, key=lambda cell: cell.stall_s)
     plans = len(worst)
-    share = ""
+    of_plans = ""
     if plans > 1:
         high = upper_bound(int(worst.values("p_any_stall").sum()), plans, 0.975)
-        share = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
+        of_plans = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
     where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
     most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {worst.stall_s:.2f} s a plan"
-    return f"{policy} stalls in {where}, {most};{share} {late}."
+    return f"{policy} stalls in {where}, {most};{of_plans} {late}."
 
 
 _EXECUTION = ("start_s", "end_s", "stalls", "stall_s", "longest_stall_s", "start_regret", "end_regret")
