@@ -20,5 +20,5 @@ def test_a_single_value_has_no_spread() -> None:
 
 
 def test_no_values_have_no_summary() -> None:
-    with pytest.raises(ValueError, match="no values"):
+    with pytest.raises(ValueError, match="at least one value"):
         summarise([])

@@ -376,7 +376,7 @@ PTP = """sending: GET CURRENT_DATA_SET
 @pytest.fixture(autouse=True)
 def nothing_read(monkeypatch: pytest.MonkeyPatch) -> None:
     for each in (clocks.CHRONY, clocks.PTP):
-        monkeypatch.setattr(each, "known", None)
+        monkeypatch.setattr(each, "last", None)
 
 
 def test_chronys_bound_is_the_root_distance_and_the_offset() -> None:
