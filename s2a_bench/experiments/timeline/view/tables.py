@@ -52,8 +52,8 @@ def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
 
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     stalling = [cell for cell in cells if cell.p_any_stall > 0]
-    share = max(cell.mean("end_regret") or 0.0 for cell in cells)
-    late = f"it ends up to {share:.0%} later than S0 allows" if share >= 0.005 else "it ends as early as S0 allows"
+    share = f"{max(cell.mean('end_regret') or 0.0 for cell in cells):.0%}"
+    late = "it ends as early as S0 allows" if share == "0%" else f"it ends up to {share} later than S0 allows"
     if not stalling:
         return f"{policy} never stalls; {late}."
     worst = max(stalling, key=lambda cell: cell.stall_s)
