@@ -282,7 +282,7 @@ class StoredRun:
 
 
 def read_run(path: Path) -> StoredRun:
-    """Open a run folder for reading; raises StoreError if it is not one, of another version, or an export that changed."""
+    """Open a run folder; raises StoreError if it is not one, of another version, or an export that changed."""
     path = Path(path)
     manifest = manifests.read(path)
     export.check(path, manifest)
