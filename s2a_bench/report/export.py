@@ -49,13 +49,13 @@ _INSTEAD: Final = {"error": "failed", "marks": "[]", "facts": "{}"}
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?([eE][-+]?\d+)?|true|false")
 _PROMPT: Final = re.compile(rf"{WITHHELD}, SHA-256 [0-9a-f]{{16}}")
 _TEXT: Final = re.compile(
-    r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00"
-    r'|([\[\]{},:]|"\w*"|(-?\d[\d.e+-]*|null)(?=[],}]))+'
-    rf"|(?!.*\d(\.\d+){{3}}|.*/\S*\.[a-z]|.*\b(home|users)/|.*\b(?=\w+=(?!-?\d))(?!({'|'.join(sorted(TEXTS))})=))"
-    r"([\w .,;()=?&+*%'`#|<>°-]|:(?=\s|$)|(?<= )@(?= )|(?<=[^\W_])/(?=[^\W_]))+",
-    re.IGNORECASE,
+    rf"""\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00                     # a time
+    | ([\[\]{{}},:] | "\w*" | (-?\d[\d.e+-]*|null)(?=[],}}]))+       # JSON of identifiers and numbers
+    | (?!.*\d(\.\d+){{3}} | .*/\S*\.[a-z] | .*\b(home|users)/        # words without an address, a file in a folder,
+      | .*(?<![\w-])(?!({"|".join(sorted(TEXTS))})=)[\w-]+=(?!-?\d)) # an option off the list
+      ([\w .,;()=?&+*%'`#|<>°-] | :(?=\s|$) | (?<=[ ])@(?=[ ]) | (?<=[^\W_])/(?=[^\W_]))+""",
+    re.IGNORECASE | re.VERBOSE,
 )
-"""A time; JSON of identifiers and numbers; words without address, path, file in a folder, or option off the list."""
 _FORMS: Final = {
     "packages": re.compile(rf"\d+(\.\d+){{1,3}}([.+-]?[A-Za-z]\w*)*|{WITHHELD}-\d+"),
     **dict.fromkeys(("stages", "service", "variants"), _TEXT),
