@@ -41,8 +41,8 @@ cell pipeline variant source gap_behaviour phase verdict duration marks facts
 """
 TEXTS: Final = frozenset(_TEXTS.split())
 """The keys and columns whose text leaves, alone or in a list."""
-HIDDEN: Final = "token_id"
-"""A column of numbers from which a model's text can be restored."""
+HIDDEN: Final = frozenset({"text", "token_id"})
+"""Columns that stay empty: what a model wrote, numbers included."""
 _INSTEAD: Final = {"error": "failed", "marks": "[]", "facts": "{}"}
 """What stands in a column for a text that does not leave."""
 
@@ -105,8 +105,10 @@ class Filter:
     def column(self, name: str, values: list[str | None]) -> list[str]:
         """Return what leaves of a column; an error is a word, as a failed request stays one."""
         instead = _INSTEAD.get(name, "")
+        if name in HIDDEN:
+            return [""] * len(values)
         if name not in TEXTS:
-            return [value if not value or _NUMBER.fullmatch(value) else instead for value in (v or "" for v in values)]
+            return ["" if not value else value if _NUMBER.fullmatch(value) else instead for value in values]
         texts = {value: self.text(value or "", instead=instead) for value in dict.fromkeys(values)}
         return [texts[value] for value in values]
 
@@ -165,7 +167,7 @@ def _write(run: StoredRun, manifest: dict[str, Any], share: Filter, target: Path
     sources = {name.rpartition(".")[0]: name for name in tables_in(run.path)}  # Parquet, if there are both
     for stem, source in sorted(sources.items()):
         table = files.read_texts(run.path / source)
-        columns = [name for name in table.column_names if name.isidentifier() and share.text(name) == name != HIDDEN]
+        columns = [name for name in table.column_names if name.isidentifier() and share.text(name) == name]
         path = target / f"{stem}.csv"
         if PROVENANCE not in columns or not TABLE.fullmatch(path.name) or share.text(stem) != stem:
             continue  # not a table of a run
