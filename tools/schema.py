@@ -31,7 +31,7 @@ from s2a_bench.inference.model_list import ListedModel
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
-from s2a_bench.store.export import ExportedRun
+from s2a_bench.store.export import FACTS, ExportedRun
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.sweep.json import PlannedCell, SweptCell
 from s2a_bench.writers.json import RatioJson
@@ -57,6 +57,8 @@ class HouseForm(GenerateJsonSchema):
         if schema["cls"] is LatencyCell:
             summary = made["properties"]["e2e_ms"]
             made["properties"] |= {each.key: summary | {"description": each.about} for each in AROUND}
+        if schema["cls"] is ExportedRun:
+            made["properties"] |= {key: {"type": "object"} for key in FACTS}
         text = " ".join(made["description"].replace("``", "`").replace("None", "null").split())
         return made | _keys(schema["cls"], made) | {"description": text, "additionalProperties": False}
 

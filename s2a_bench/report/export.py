@@ -1,16 +1,17 @@
-"""Write runs as folders to share, each with the fields of an allow-list (docs/share.md).
+"""Write runs as folders to share (docs/share.md).
 
-Of a manifest the keys of `ExportedRun` leave: numbers everywhere below them, texts under the keys of `TEXTS`. Of a
-table numbers leave, and the texts of `COLUMNS`. Paths, addresses, and names of hosts and users are removed from these
-texts; equal ones have equal placeholders, so rows and manifest still fit.
+Numbers leave. A text leaves if its key or column is on the list, it has the form of words or of a cell's name, and it
+has no name of a host or user. Any other text is withheld as a whole.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import socket
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields
 from hashlib import sha256
 from itertools import count
@@ -18,13 +19,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.inference import ENGINES
-from s2a_bench.machine.resources import SPENT
-from s2a_bench.provenance import Provenance
 from s2a_bench.store import files
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.export import FORMAT, KEY, TABLE, WITHHELD, ExportedFile, ExportedRun, tables_in
+from s2a_bench.store.export import FACTS, FORMAT, KEY, TABLE, WITHHELD, ExportedFile, ExportedRun, tables_in
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.store.sweep import is_sweep, read_sweep
@@ -32,156 +30,98 @@ from s2a_bench.trace import STAGES
 from s2a_bench.transport import TRANSPORTS
 
 _TEXTS: Final = """
-s2a_bench kernel machine python cpu governor clock_source board power_mode name driver ROS_DISTRO ROS_DOMAIN_ID
-ROS_AUTOMATIC_DISCOVERY_RANGE RMW_IMPLEMENTATION nonce dds unit about what
-engine model_sha256 mmproj_sha256 quantisation architecture projector model_type kv_type flash_attention
-llama_cpp_python sampling answer latency profile gaps prompt_origin title origin family guarantee asked chosen
-command mode payload size observation policies policy modes rules rounding simulator robot time transports request_id
+command started finished code s2a_bench kernel machine python cpu governor clock_source board power_mode name driver
+ROS_DISTRO ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE RMW_IMPLEMENTATION nonce dds unit about what pictures provenance
+engine model model_sha256 mmproj_sha256 quantisation architecture projector model_type kv_type flash_attention reader
+llama_cpp_python sampling answer latency profile gaps prompt_origin title origin family guarantee asked chosen clock
+mode payload size observation policies policy modes rules rule rounding simulator robot robots time transports transport
 connection dialect qos dds_tuning middleware template layout llama_server follower gap jitter load limit service link
-transport skills orders outcome env success stall period study cadence follower_law weights tokens clock profiles robots
+skills orders outcome env success stall period study start tokens weights link_profile under_way request_id used_by
+cell pipeline variant source gap_behaviour phase verdict duration marks facts
 """
 TEXTS: Final = frozenset(_TEXTS.split())
-"""The keys whose text leaves, alone or in a list."""
-MAPS: Final = frozenset({"stages", "service", "variants"})
-"""The keys of mappings whose texts leave."""
-HASHED: Final = frozenset({"prompt"})
-"""The keys of texts whose checksum leaves, as runs with different ones are not alike."""
-_COLUMNS: Final = """
-cell pipeline variant payload connection engine mode size request_id used_by marks facts policy board title study
-simulator follower gap_behaviour outcome phase source verdict limit rule latency rounding duration family reader
-provenance
-"""
-COLUMNS: Final = frozenset(_COLUMNS.split())
-"""The columns whose text leaves."""
-HIDDEN: Final = frozenset({"token_id"})
-"""Columns of numbers from which a model's text can be restored."""
+"""The keys and columns whose text leaves, alone or in a list."""
+HIDDEN: Final = frozenset({"text", "token_id"})
+"""Columns that stay empty: what a model wrote, numbers included."""
+_INSTEAD: Final = {"error": "failed", "marks": "[]", "facts": "{}"}
+"""What stands in a column for a text that does not leave."""
 
-_PLAIN: Final = "withheld localhost none home jetson nvidia ubuntu"
-"""Words that identify nothing, even if a host has such a name, as the words of stages, facts and keys."""
-_PASSES: Final = 3
-"""What one pass leaves beside a placeholder may be a path or an address."""
-_LONG: Final = 8
-"""A shorter name of a host or user is removed as a separate word only."""
-_TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00")
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?([eE][-+]?\d+)?|true|false")
-_CODE: Final = re.compile(r"[a-z0-9-]+")
-_HASH: Final = re.compile(rf"{WITHHELD}, SHA-256 [0-9a-f]{{16}}")
-_VERSION: Final = re.compile(r"\d+(\.\d+){1,3}([.+-]?[A-Za-z]\w*)*")
-_NAME: Final = re.compile(r"[\w.-]*[A-Za-z][\w.-]*")
-_AT: Final = r"@(?=[A-Za-z\[]|\d+\.\d+\.\d)"
-_NAMED: Final = re.compile(
-    r"[/\\](?:home|users)[/\\]+([^/\\\s\"',;)]+)|~([\w-]+)"
-    rf"|([\w.-]+){_AT}|(?:://(?:[^/@\s]*@)?|\w@)({_NAME.pattern})",
-    re.IGNORECASE,
+_PROMPT: Final = re.compile(rf"{WITHHELD}, SHA-256 [0-9a-f]{{16}}")
+_TEXT: Final = re.compile(
+    rf"""\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00                     # a time
+    | ([\[\]{{}},:] | "\w*" | (-?\d[\d.e+-]*|null)(?=[],}}]))+       # JSON of identifiers and numbers
+    | (?!.*\d(\.\d+){{3}} | .*/\S*\.[a-z] | .*\b(home|users)/        # words without an address, a file in a folder,
+      | .*(?<![\w-])(?!({"|".join(sorted(TEXTS))})=)[\w-]+=(?!-?\d)) # an option off the list
+      ([\w .,;()=?&+*%'`#|<>°-] | :(?=\s|$) | (?<=[ ])@(?=[ ]) | (?<=[^\W_])/(?=[^\W_]))+""",
+    re.IGNORECASE | re.VERBOSE,
 )
-"""Users by their home folders, users and hosts by addresses."""
-_PLACES: Final = (
-    r"(?<![a-z0-9+.-])[a-z][a-z0-9+.-]*://[^\s\"',;)]*",
-    rf"(?<![\w.+-])[\w.+-]+{_AT}[^\s\"',;)]*",
-    r"(?<![0-9a-z])(?:[0-9a-f]{0,4}:){2,7}[0-9a-f]{0,4}(?![0-9a-z])",  # IPv6, MAC
-    r"(?<!\d)\d{1,3}(?:\.\d{1,3}){3}(?!\d)",
-    r"(?<!\w)(?:[a-z]:|~[\w-]*|\.{1,2})?[/\\]+[^\s\"',;)/\\][^\"',;)\n]*",
-    r"[/\\]+(?:home|users)[/\\][^\"',;)\n]*",
-    r"(?<![\w.~/\\-])[\w.~-]+(?:[/\\][\w.~-]+)*[/\\][\w.~-]*\.[a-z]\w*",  # a relative path to a file
+_FORMS: Final = {
+    "packages": re.compile(rf"\d+(\.\d+){{1,3}}([.+-]?[A-Za-z]\w*)*|{WITHHELD}-\d+"),
+    **dict.fromkeys(("stages", "service", "variants"), _TEXT),
+}
+"""The form of every text in mappings of these keys."""
+_PLACES: Final = re.compile(
+    r'"host": "([\w.-]+)|[/\\](?:home|users)[/\\]+([\w.-]+)|://(?:[^/@"]*@)?([\w.-]+)', re.IGNORECASE
 )
+"""Where a manifest has the names of hosts and users."""
+_PLAIN: Final = "localhost none real root home jetson nvidia ubuntu cpu gpu memory power energy client"
+"""Names of hosts and users that identify nothing, as the list, stages, transports and engines."""
 
 
-class Words:
-    """Removes from texts what identifies a machine or a person."""
+class Filter:
+    """Selects the texts of a run that leave; one that does not has the same placeholder everywhere."""
 
     def __init__(self, manifest: Mapping[str, Any]) -> None:
-        """Collect the names of hosts and users that a manifest has anywhere, and those of this process."""
+        """Collect the names of hosts and users that a manifest has, and those of this process."""
         names = {socket.gethostname(), *(Path(os.environ.get(name, "")).name for name in ("HOME", "LOGNAME", "USER"))}
-        names |= {*map(str, manifest.get("machines") or ())}
-        for key, text in _texts(manifest):
-            names |= {name for match in _NAMED.findall(text) for name in match}
-            names |= {*_NAME.findall(text)} if key == "host" else set()
-        plain = _plain()
-        names |= {name.partition(".")[0] for name in names}
-        names = {name for name in names if len(name) > 1 and _NAME.search(name) and name.lower() not in plain}
-        patterns = sorted(map(_pattern, names), key=lambda pattern: (-len(pattern), pattern))
-        self._names = re.compile("|".join(patterns) or r"(?!)", re.IGNORECASE)
-        self._all = re.compile("|".join((*_PLACES, *patterns)), re.IGNORECASE)
+        names |= {name for match in _PLACES.findall(json.dumps(manifest, ensure_ascii=False)) for name in match}
+        names = {part.lower() for name in names for part in (name, name.partition(".")[0])}
+        plain = re.findall(r"[a-z\d]+", " ".join((_PLAIN, WITHHELD, *TEXTS, *STAGES, *TRANSPORTS, *ENGINES)).lower())
+        names = {name for name in names if re.search("[a-z].|.[a-z]", name)}.difference(plain)
+        every = "|".join(map(re.escape, sorted(names, reverse=True))) or r"(?!)"
+        self._names = re.compile(rf"(?<![^\W_])({every})(?![^\W_])", re.IGNORECASE)
         self._placeholders: dict[str, str] = {}
 
-    def cleaned(self, text: str) -> str:
-        for _ in range(_PASSES):
-            text = self._all.sub(self._placeholder, text)
-        return text
+    def text(self, text: str, form: re.Pattern[str] = _TEXT, instead: str = "") -> str:
+        """Return a text that leaves; else what is written instead, by default its placeholder."""
+        if not text or (form.fullmatch(text) and not self._names.search(text)):
+            return text
+        return instead or self._placeholders.setdefault(text, f"{WITHHELD}-{len(self._placeholders) + 1}")
 
-    def _placeholder(self, match: re.Match[str]) -> str:
-        return self._placeholders.setdefault(match[0], f"{WITHHELD}-{len(self._placeholders) + 1}")
-
-    def tree(self, value: Any, texts: Collection[str], key: str = "", *, shared: bool = False) -> Any:
-        """Return JSON with its numbers and, if ``shared`` or under a key of ``texts``, its texts."""
-        if isinstance(value, dict) and key == "packages":  # 5.0.0.93 is no address there
-            versions = {self.cleaned(name): str(text) for name, text in value.items() if _VERSION.fullmatch(str(text))}
-            return {name: self._names.sub(self._placeholder, text) for name, text in versions.items()}
+    def tree(self, value: Any, key: str, form: re.Pattern[str] | None = None) -> Any:
+        """Return JSON with its numbers, and with texts whose key is on the list or that have a form."""
+        form = _TEXT if key in TEXTS else form
         if isinstance(value, dict):
-            return {
-                self.cleaned(name): self.tree(item, texts, name, shared=name in texts or key in MAPS)
-                for name, item in value.items()
-            }
+            return {self.text(name): self.tree(item, name, _FORMS.get(key)) for name, item in value.items()}
         if isinstance(value, list):
-            return [self.tree(item, texts, key, shared=shared) for item in value]
-        if not isinstance(value, str) or not value:
+            return [self.tree(item, key, form) for item in value]
+        if not isinstance(value, str) or not value or (key == "prompt" and _PROMPT.fullmatch(value)):
             return value
-        if key in HASHED:
-            hashed = f"{WITHHELD}, SHA-256 {sha256(value.encode()).hexdigest()[:16]}"
-            return value if _HASH.fullmatch(value) else hashed
-        return self.cleaned(value) if shared else WITHHELD
+        if key == "prompt":
+            return f"{WITHHELD}, SHA-256 {sha256(value.encode()).hexdigest()[:16]}"
+        return self.text(value, form) if form else WITHHELD
 
-    def column(self, name: str, values: Sequence[str | None]) -> list[str]:
-        """Return what leaves of a column of a table; an error is a word, as a failed request stays one."""
-        if name in COLUMNS:
-            cleaned = {value: self.cleaned(value or "") for value in dict.fromkeys(values)}
-            return [cleaned[value] for value in values]
-        if name == "error":
-            return ["failed" if value else "" for value in values]
-        return [value if value and name not in HIDDEN and _NUMBER.fullmatch(value) else "" for value in values]
-
-
-def _pattern(name: str) -> str:
-    return re.escape(name) if len(name) >= _LONG else f"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])"
-
-
-def _plain() -> set[str]:
-    transports = [transport for _, transport in TRANSPORTS.loaded()]
-    names = {*STAGES, *SPENT, *(name for each in transports for name in (*each.stages, *each.facts))}
-    names |= {*TEXTS, *COLUMNS, *TRANSPORTS, *ENGINES, *EXPERIMENTS, *(field.name for field in fields(ExportedRun))}
-    return {*_PLAIN.split(), *names, *(word for name in names for word in name.split("_"))}
-
-
-def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Yield every text of JSON with its key, and every key."""
-    if isinstance(value, str):
-        yield key, value
-    elif isinstance(value, dict):
-        for name, item in value.items():
-            yield "", name
-            yield from _texts(item, name)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _texts(item, key)
+    def column(self, name: str, values: list[str | None]) -> list[str]:
+        """Return what leaves of a column; an error is a word, as a failed request stays one."""
+        instead = _INSTEAD.get(name, "")
+        if name in HIDDEN:
+            return [""] * len(values)
+        if name not in TEXTS:
+            return ["" if not value else value if _NUMBER.fullmatch(value) else instead for value in values]
+        texts = {value: self.text(value or "", instead=instead) for value in dict.fromkeys(values)}
+        return [texts[value] for value in values]
 
 
 def check_folder(folder: Path) -> None:
     """Raise UsageError for a file, and for a folder with anything that no export wrote."""
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"`export`: {folder} is a file; name a folder")
-    try:
-        others = [path for path in sorted(folder.iterdir()) if not _is_export(path)] if folder.exists() else []
-    except OSError as error:
-        raise UsageError(f"`export`: cannot read {folder}: {error.strerror}; name another folder") from error
-    if others:
-        raise UsageError(f"`export`: {folder} has {others[0].name}, which no export wrote; name another folder")
-
-
-def _is_export(folder: Path) -> bool:
-    try:
-        return KEY in manifests.read(folder)
-    except StoreError:
-        return False
+    for path in sorted(folder.glob("*")):
+        with suppress(StoreError):
+            if KEY in manifests.read(path):
+                continue
+        raise UsageError(f"`export`: {folder} has {path.name}, which no export wrote; name another folder")
 
 
 def write_exports(paths: Iterable[Path], folder: Path) -> list[Path]:
@@ -189,8 +129,8 @@ def write_exports(paths: Iterable[Path], folder: Path) -> list[Path]:
     written: list[Path] = []
     for run in _runs(dict.fromkeys(path.resolve() for path in paths)):
         with fits(run):
-            words = Words(run.manifest)
-            manifest = _manifest(run.manifest, words)
+            share = Filter(run.manifest)
+            manifest = _manifest(run.manifest, share)
         when = re.sub(r"[-:]|\+.*", "", manifest["started"]) + "Z" if manifest["started"] else "undated"
         stem = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{when}-{manifest['command']}")
         names = (stem if number == 1 else f"{stem}-{number}" for number in count(1))
@@ -198,7 +138,7 @@ def write_exports(paths: Iterable[Path], folder: Path) -> list[Path]:
         if target.resolve() == run.path:
             raise UsageError(f"`export`: {target} is the run itself; name another folder")
         try:
-            _write(run, manifest, words, target)
+            _write(run, manifest, share, target)
         except OSError as error:
             raise StoreError(f"cannot write {target}: {files.why(error, folder)}") from error
         written.append(target)
@@ -208,44 +148,33 @@ def write_exports(paths: Iterable[Path], folder: Path) -> list[Path]:
 def _runs(paths: Iterable[Path]) -> Iterator[StoredRun]:
     for path in paths:
         run = read_run(path)
-        if is_sweep(run.manifest):
-            yield from (cell for _, cell in read_sweep(path).runs())
-        else:
-            yield run
+        yield from (cell for _, cell in read_sweep(path).runs()) if is_sweep(run.manifest) else (run,)
 
 
-def _manifest(kept: Mapping[str, Any], words: Words) -> dict[str, Any]:
-    """Return what leaves of a manifest, in the order of `ExportedRun`; that of a mapping stays, as of stages."""
-    of_provenance = {field.name for field in fields(Provenance)}
-    whole: dict[str, Any] = {"configuration": {}, "environment": {}, "seeds": {}}
-    for name in (field.name for field in fields(ExportedRun) if kept.get(field.name) is not None):
-        texts = of_provenance if name == PROVENANCE else TEXTS
-        whole[name] = words.tree(kept[name], texts, name, shared=name in TEXTS)
-    for name in ("started", "finished"):
-        whole[name] = text if _TIME.fullmatch(text := str(kept.get(name))) else None
-    codes = [words.cleaned(code) for each in kept.get("warnings", []) if _CODE.fullmatch(code := each["code"])]
-    about = {"message": "the text of a warning is not shared", "advice": "see docs/share.md"}
-    whole |= {"schema": kept["schema"], "state": kept["state"], "started": whole["started"] or ""}
-    whole |= {KEY: {"schema": FORMAT, "files": {}}, "warnings": [{"code": code, **about} for code in codes]}
-    return {field.name: whole[field.name] for field in fields(ExportedRun) if field.name in whole}
+def _manifest(kept: Mapping[str, Any], share: Filter) -> dict[str, Any]:
+    """Return what leaves of a manifest."""
+    kept = {"started": "", "configuration": {}, "environment": {}, "seeds": {}, "warnings": [], **kept}
+    whole = {"schema": kept["schema"], "state": kept["state"], KEY: {"schema": FORMAT, "files": {}}}
+    names = {*(field.name for field in fields(ExportedRun)), *FACTS}.difference(whole)
+    return whole | {name: share.tree(item, name) for name, item in kept.items() if name in names and item is not None}
 
 
-def _write(run: StoredRun, manifest: dict[str, Any], words: Words, target: Path) -> None:
+def _write(run: StoredRun, manifest: dict[str, Any], share: Filter, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     manifests.write(target, manifest)  # what is interrupted is an export, too
     for name in tables_in(target):
         (target / name).unlink()
     sources = {name.rpartition(".")[0]: name for name in tables_in(run.path)}  # Parquet, if there are both
     for stem, source in sorted(sources.items()):
-        batches = files.read_texts(run.path / source)
-        columns = [name for name in next(batches) if name.isidentifier() and words.cleaned(name) == name]
+        table = files.read_texts(run.path / source)
+        columns = [name for name in table.column_names if name.isidentifier() and share.text(name) == name]
         path = target / f"{stem}.csv"
-        if PROVENANCE not in columns or not TABLE.fullmatch(path.name) or words.cleaned(stem) != stem:
+        if PROVENANCE not in columns or not TABLE.fullmatch(path.name) or share.text(stem) != stem:
             continue  # not a table of a run
         with path.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
             file.write(files.record(columns))
-            for batch in batches:
-                rows = zip(*(words.column(name, batch[name]) for name in columns), strict=True)
+            for batch in table.select(columns).to_batches(max_chunksize=1 << 16):
+                rows = zip(*map(share.column, columns, batch.to_pydict().values()), strict=True)
                 file.writelines(map(files.record, rows))
         manifest[KEY]["files"][path.name] = asdict(ExportedFile.of(path))
     manifests.write(target, manifest)

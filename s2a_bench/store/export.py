@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -23,8 +23,7 @@ KEY: Final = "export"
 """The key of a manifest that an export wrote."""
 WITHHELD: Final = "withheld"
 """What stands in an exported run for a text that is not shared."""
-Format: TypeAlias = Literal["s2a-bench-export/1"]
-FORMAT: Final[Format] = "s2a-bench-export/1"
+FORMAT: Final = "s2a-bench-export/1"
 TABLE: Final = re.compile(r"[a-z][a-z0-9_]*\.csv")
 """The name of a table's file."""
 
@@ -39,19 +38,18 @@ class ExportedFile:
     @classmethod
     def of(cls, path: Path) -> ExportedFile:
         """Read a file piece by piece; raises OSError."""
-        digest, size = hashlib.sha256(), 0
+        digest = hashlib.sha256()
         with path.open("rb") as file:
             while piece := file.read(1 << 20):
                 digest.update(piece)
-                size += len(piece)
-        return cls(size, digest.hexdigest())
+            return cls(file.tell(), digest.hexdigest())
 
 
 @dataclass(frozen=True)
 class Export:
     """The version of this format, and the tables beside the manifest."""
 
-    schema: Format
+    schema: Literal["s2a-bench-export/1"]
     files: Annotated[dict[str, ExportedFile], Facts(propertyNames={"pattern": f"^{TABLE.pattern}$"})]
 
 
@@ -64,38 +62,27 @@ class ExportedRun:
     command: str
     state: Literal["running", "finished", "interrupted", "failed"]
     started: Annotated[str, about("UTC.")]
-    finished: str | None
+    finished: str | None = None
     configuration: dict[str, Any]
     environment: dict[str, Any]
     seeds: dict[str, Any]
     warnings: list[RunWarning]
     stages: Annotated[dict[str, str] | None, about("Stage -> group, in the order of the path.")] = None
     facts: Annotated[dict[str, Any] | None, about("Unit and meaning of each fact of a request.")] = None
-    tuning: dict[str, Any] | None = None
-    cadence: str | None = None
-    mark_cost_ns: float | None = None
     model: Annotated[dict[str, Any] | None, about("With the SHA-256 of its files.")] = None
     provenance: Annotated[Origins | None, about("Of the run, and of its cells if they differ.")] = None
-    resources: dict[str, Any] | None = None
-    flash_attention: dict[str, Any] | None = None
     boards: list[dict[str, Any]] | None = None
-    calibrations: dict[str, Any] | None = None
-    start_jitter: dict[str, Any] | None = None
-    executions: dict[str, Any] | None = None
-    live: dict[str, Any] | None = None
-    prior: dict[str, Any] | None = None
-    request: dict[str, Any] | None = None
-    requests: dict[str, Any] | None = None
-    step_s: float | None = None
-    studies: dict[str, Any] | None = None
-    follower_law: str | None = None
-    robot: dict[str, Any] | None = None
     service: dict[str, Any] | str | None = None
-    reference: dict[str, Any] | None = None
-    link: dict[str, Any] | None = None
-    sends: dict[str, Any] | None = None
-    tap: dict[str, Any] | None = None
-    topics: dict[str, Any] | None = None
+    mark_cost_ns: float | None = None
+    step_s: float | None = None
+
+
+_FACTS: Final = """
+tuning resources flash_attention calibrations start_jitter executions live prior request requests studies robot
+reference link sends tap topics
+"""
+FACTS: Final = tuple(_FACTS.split())
+"""Further keys of an exported manifest, each an object as in that of a run."""
 
 
 def check(folder: Path, manifest: Mapping[str, Any]) -> None:
@@ -108,10 +95,10 @@ def check(folder: Path, manifest: Mapping[str, Any]) -> None:
         where = ".".join(map(str, (KEY, *error.errors()[0]["loc"])))
         raise StoreError(f"{folder / NAME} is damaged: {where[:80]}: {error.errors()[0]['msg']}") from None
     for path in (folder / name for name in sorted({*files, *tables_in(folder)})):
-        if (listed := files.get(path.name)) is None or not TABLE.fullmatch(path.name):
+        if path.name not in files or not TABLE.fullmatch(path.name):
             raise StoreError(f"{path} is not among the files of {folder / NAME}: remove it, or fetch the folder again")
         try:
-            same = path.stat().st_size == listed.bytes and ExportedFile.of(path) == listed
+            same = ExportedFile.of(path) == files[path.name]
         except OSError as error:
             raise StoreError(f"cannot read {path}: {error.strerror}; fetch the folder again") from error
         if not same:

@@ -82,10 +82,6 @@ VALUES: Final = 500_000_000
 """Limit on the values (rows times columns) read of a Parquet file: a few bytes can encode any number of equal ones."""
 
 
-HEADER_LETTERS: Final = 1 << 16
-"""Limit on the header of a CSV file."""
-
-
 def _arrow(path: Path) -> tuple[Any, Any, Any]:
     """Return pyarrow, its CSV and its Parquet module; raises MissingExtra if it does not load beside this NumPy."""
     try:
@@ -202,22 +198,16 @@ def _bounded(path: Path, rows: int, columns: int) -> int:
     return rows
 
 
-def read_texts(path: Path) -> Iterator[dict[str, list[str | None]]]:
-    """Yield all columns of a Parquet or CSV file as text: first without rows, then some rows at a time."""
+def read_texts(path: Path) -> Any:
+    """Return all columns of a Parquet or CSV file as texts, in a ``pyarrow.Table``; raises StoreError."""
     pa, _, parquet = _arrow(path)
-    if path.suffix == ".parquet":
-        with _undamaged(path, pa), parquet.ParquetFile(path) as file:
-            names = file.schema_arrow.names
-            _bounded(path, file.metadata.num_rows, len(names))
-            yield {name: [] for name in names}
-            for batch in file.iter_batches():
-                yield {name: column.cast(pa.string()).to_pylist() for name, column in zip(names, batch, strict=True)}
-        return
-    with path.open(encoding="utf-8", errors="replace") as file:
-        names = file.readline(HEADER_LETTERS).strip().split(",")
-    yield {name: [] for name in names}
-    for batch in read_csv(path, dict.fromkeys(names, "string")).to_batches(max_chunksize=1 << 16):
-        yield batch.to_pydict()
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return read_csv(path, dict.fromkeys(file.readline().strip().split(","), "string"))
+    with _undamaged(path, pa), parquet.ParquetFile(path) as stored:
+        names = stored.schema_arrow.names
+        _bounded(path, stored.metadata.num_rows, len(names))
+        return stored.read().cast(pa.schema([(name, pa.string()) for name in names]))
 
 
 @contextmanager
