@@ -153,19 +153,12 @@ def jerk(speed_mps: Floats, sample_s: float) -> Floats:
     return np.diff(np.asarray(speed_mps, dtype=np.float64), 2) / sample_s**2
 
 
-def rms_jerk(speed_mps: Floats, sample_s: float) -> float:
-    return float(np.sqrt(np.mean(jerk(speed_mps, sample_s) ** 2)))
-
-
-def peak_jerk(speed_mps: Floats, sample_s: float) -> float:
-    return float(np.abs(jerk(speed_mps, sample_s)).max())
-
-
 def motion(speed_mps: Floats, sample_s: float) -> dict[str, float]:
     """Return jerk and smoothness of a speed profile by the columns of rows."""
+    jerks = jerk(speed_mps, sample_s)
     return {
-        "rms_jerk": rms_jerk(speed_mps, sample_s),
-        "peak_jerk": peak_jerk(speed_mps, sample_s),
+        "rms_jerk": float(np.sqrt(np.mean(jerks**2))),
+        "peak_jerk": float(np.abs(jerks).max()),
         "sparc": sparc(speed_mps, sample_s),
     }
 
