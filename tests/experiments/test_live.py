@@ -86,8 +86,8 @@ def outcomes(run: StoredRun) -> list[str]:
     return [execution["outcome"] for execution in run.manifest["executions"].values()]
 
 
-def check(run: StoredRun, transport: str) -> None:
-    """Check what holds of every live run that went well."""
+def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineLive, tmp_path: Path) -> None:
+    run, view = live(config, tmp_path)
     assert run.manifest["state"] == "finished"
     assert outcomes(run) == ["completed"] * 3
     cells = timelines_of(run)
@@ -106,19 +106,14 @@ def check(run: StoredRun, transport: str) -> None:
         assert all(re.fullmatch(r"\w+\(\w+(, \w+)?\)", skill.text) for skill in cell.skills)
     assert wait.skills[0].start_ns >= wait.skills[-1].arrival_ns
     assert len({tuple(skill.text for skill in cell.skills) for cell in cells}) == 1
-    assert run.manifest["live"]["transport"] == transport
+    assert run.manifest["live"]["transport"] == "loopback"
     assert run.manifest["start_jitter"]["starts"] == 24
     jsonschema.validate(timelines_json(run, cells), SCHEMA)
-
-
-def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineLive, tmp_path: Path) -> None:
-    run, view = live(config, tmp_path)
-    check(run, "loopback")
     assert run.manifest["live"]["emulated"] is True
     assert [len(scene.records) for scene in view.scenes] == [3]
-    (note,) = origin_notes(run.manifest, timelines_of(run))
+    (note,) = origin_notes(run.manifest, cells)
     assert note.startswith("EMULATED tokens over loopback, parsed and executed as they arrive")
-    assert list(timeline_figures(timelines_of(run), ())) == ["timeline"]
+    assert list(timeline_figures(cells, ())) == ["timeline"]
     assert run.samples["warmup"].tolist() == [True, False]
     warm_ns = run.tokens["client_ns"].iloc[:48]
     assert run.manifest["prior"]["mean_s"] == pytest.approx((warm_ns.iloc[-1] - warm_ns.iloc[0]) / 47e9)

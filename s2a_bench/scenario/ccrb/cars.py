@@ -52,7 +52,7 @@ class Cars:
     follower: str = "careful"
     """The trailing car's law, a name of FOLLOWERS."""
     reflex: bool = False
-    """Whether the ego also brakes independently of the plan: `ego.Reflex`."""
+    """Whether the ego also brakes independently of the plan, near contact."""
 
 
 @dataclass(frozen=True, slots=True)
