@@ -248,13 +248,6 @@ def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
     assert (rows["caution"].isna() == (rows["policy"] != "stream-to-act")).all()
 
 
-def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
-    config = TimelineComputed(profiles=(), rates=(0.001,), tokens_per_skill=(6,), t_nom_s=(4000.0,))
-    rows = ran(config, tmp_path).table(TIMELINES)
-    assert rows[["rms_jerk", "peak_jerk", "sparc"]].isna().all().all()
-    assert rows["stalls"].notna().all()
-
-
 def row_of_plan(arrival_s: np.ndarray, duration_s: np.ndarray) -> TimelineRow:
     """Make the row of a plan of skills of 1 s that start as they arrive and run for ``duration_s``."""
     nominal_s = np.ones(arrival_s.shape)
@@ -264,9 +257,15 @@ def row_of_plan(arrival_s: np.ndarray, duration_s: np.ndarray) -> TimelineRow:
     return made
 
 
-def test_a_skill_that_fails_at_once_has_a_row_and_no_motion() -> None:
-    row = row_of_plan(np.ones((1, 1)), np.zeros((1, 1)))
-    assert (row.start_ns, row.end_ns, row.sparc, row.rms_jerk) == (10**9, 10**9, None, None)
+@pytest.mark.parametrize(
+    ("arrival_s", "duration_s"), [([1.0], [0.0]), ([1.0, 2000.0], [1.0, 1.0])], ids=["fails at once", "long"]
+)
+def test_a_plan_without_time_or_of_hours_has_a_row_and_no_motion(
+    arrival_s: list[float], duration_s: list[float]
+) -> None:
+    row = row_of_plan(np.array([arrival_s]).T, np.array([duration_s]).T)
+    assert (row.start_ns, row.end_ns) == (10**9, round((arrival_s[-1] + duration_s[-1]) * 1e9))
+    assert {row.rms_jerk, row.peak_jerk, row.sparc} == {None}
 
 
 def test_every_metric_is_computed_and_kept_as_its_column_holds_it() -> None:
