@@ -9,7 +9,6 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
@@ -21,6 +20,7 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import MARK, NO_SCORE
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 
 GRID = {"phase": True, "phase_points": (21, 13)}
 
@@ -29,8 +29,7 @@ GRID = {"phase": True, "phase_points": (21, 13)}
 def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., StoredRun]:
     @cache
     def make(**options: Any) -> StoredRun:
-        with RunProgress() as progress:
-            return read_run(run_ccrb(CcrbComputed(**options), tmp_path_factory.mktemp("runs"), progress))
+        return read_run(run_ccrb(CcrbComputed(**options), tmp_path_factory.mktemp("runs"), NullProgress()))
 
     return make
 

@@ -9,7 +9,6 @@ import jsonschema
 import numpy as np
 import pytest
 
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.live import run_live, run_live_loop
@@ -22,6 +21,7 @@ from s2a_bench.scenario import SIMULATORS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Request, Token
@@ -41,8 +41,7 @@ def replayed(profile: str) -> DrivingRequests:
 
 def drive(requests: DrivingRequests, folder: Path) -> StoredRun:
     config = CcrbLive(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, requests=requests)
-    with RunProgress() as progress:
-        return read_run(run_live(config, folder, progress))
+    return read_run(run_live(config, folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +122,8 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
                 yield token
 
     monkeypatch.setattr(LoopbackClient, "request", cut)
-    with pytest.raises(
-        TransportError, match=r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
-    ):
+    message = r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
+    with pytest.raises(TransportError, match=message):
         drive(replayed(fast_board), tmp_path / "runs")
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L
@@ -146,8 +144,7 @@ def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
         simulator="stand-in",
         ego=ego,
     )
-    with RunProgress() as progress:
-        run = read_run(run_live_loop(config, tmp_path, progress))
+    run = read_run(run_live_loop(config, tmp_path, NullProgress()))
     (world,) = RosSimulator.opened
     driven = run.table(ROLLOUTS).query("study == 'point'")
     assert list(driven["simulator"]) == ["stand-in"]

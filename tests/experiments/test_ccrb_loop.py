@@ -14,7 +14,6 @@ import pandas as pd
 import pytest
 
 from s2a_bench.act.events import AbortRequested, Event, Requested, StreamEnded, VirtualInbox
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, DrivingRequests
@@ -35,6 +34,7 @@ from s2a_bench.scenario.ccrb.studies import draw
 from s2a_bench.scenario.embedded import Embedded
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Piece, Request
 
@@ -98,8 +98,7 @@ def test_a_step_as_on_the_clock_changes_gaps_by_decimetres_at_most(number: int) 
 
 def run(folder: Path, profile: str = "jetson-agx-orin", **options: Any) -> StoredRun:
     requests = DrivingRequests(transports="loopback", engine=EngineConfig(name="replay", profile=profile))
-    with RunProgress() as progress:
-        return read_run(run_live_loop(CcrbLiveLoop(requests=requests, **options), folder, progress))
+    return read_run(run_live_loop(CcrbLiveLoop(requests=requests, **options), folder, NullProgress()))
 
 
 def by_study(stored: StoredRun, study: str) -> pd.DataFrame:
