@@ -135,7 +135,6 @@ def test_the_findings_name_every_gap_behaviour(diagram: StoredRun) -> None:
     lines = [finding(gap, scenes_of(diagram, gap), 14.0) for gap in GAPS]
     assert [line.split(":")[0] for line in lines] == list(GAPS)
     assert "holds nowhere" in lines[GAPS.index("hold")]
-    assert rate_span(scenes_of(diagram, "hold")) is None
 
 
 def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(diagram: StoredRun) -> None:

@@ -56,11 +56,6 @@ def test_who_starts_at_the_deadline_just_keeps_the_safety_distance(
         assert least_gap(cars, own, deadline_s) == pytest.approx(SAFETY_M, abs=0.1)
 
 
-def test_the_deadline_of_the_operating_point() -> None:
-    wanted = 38 / 13.889 + 6.944 * (1 / 2 - 1 / 3.472)
-    assert float(start_deadline(Cars(), 50 / 3.6 / 4)) == pytest.approx(wanted, abs=1e-3)
-
-
 @given(st.floats(5, 30), st.floats(1, 60), st.floats(0, 30), st.floats(0, 8))
 def test_braking_as_needed_just_avoids_the_car_ahead(speed: float, room: float, ahead: float, decel: float) -> None:
     need = float(needed(np.array([speed]), np.array([room]), np.array([ahead]), np.array([decel]))[0])

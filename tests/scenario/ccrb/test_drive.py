@@ -110,12 +110,6 @@ def test_the_reflex_layer_saves_the_one_who_waits() -> None:
     assert reflex.min_front_gap_m[0] > 0
 
 
-def test_the_hybrid_follower_turns_the_rear_outcome_round() -> None:
-    naive, stream = (driven("longitudinal", policy, follower="hybrid").outcomes for policy in ("naive", "stream"))
-    assert stream.name(0) == "rear"
-    assert not naive.rear_impact_mps[0] > stream.rear_impact_mps[0] - 0.5
-
-
 @pytest.mark.slow
 @laws
 def test_a_drive_that_ends_when_all_is_decided_has_the_outcome_of_a_long_one(follower: str) -> None:
