@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise, product
 from pathlib import Path
@@ -80,6 +80,18 @@ def failed(config: TimelineLive, output: Path, error: type[BaseException], match
     with pytest.raises(error, match=match):
         run_live(config, output / "runs", view)
     return read_run(view.folder)
+
+
+def dying(stream: Callable[..., Iterable[Token]], tokens: int, error: Exception) -> Callable[..., Iterator[Token]]:
+    """Return a stream that breaks after so many tokens."""
+
+    def dies(*given: object) -> Iterator[Token]:
+        for token in stream(*given):
+            if token.index == tokens:
+                raise error
+            yield token
+
+    return dies
 
 
 def outcomes(run: StoredRun) -> list[str]:
@@ -175,15 +187,8 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
 def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
 ) -> None:
-    whole = ReplayEngine.generate
-
-    def dies(self: ReplayEngine, request: Request) -> Iterator[Token]:
-        for token in whole(self, request):
-            if token.index == tokens:
-                raise EngineError("the board fell off the robot")
-            yield token
-
-    monkeypatch.setattr(ReplayEngine, "generate", dies)
+    error = EngineError("the board fell off the robot")
+    monkeypatch.setattr(ReplayEngine, "generate", dying(ReplayEngine.generate, tokens, error))
     run = failed(requesting(config, warmup=0), tmp_path, TransportError, "no request of loopback succeeded")
     assert run.manifest["state"] == "failed"
     assert run.samples["error"].tolist() == ["RequestFailed: the board fell off the robot"]
@@ -200,15 +205,8 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
     config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = LoopbackClient.request
-
-    def dies(self: LoopbackClient, request: Request, trace: Trace) -> Iterator[Token]:
-        for token in whole(self, request, trace):
-            if token.index == 20:
-                raise ServerDied("the server (pid 7) died, killed by signal 9")
-            yield token
-
-    monkeypatch.setattr(LoopbackClient, "request", dies)
+    error = ServerDied("the server (pid 7) died, killed by signal 9")
+    monkeypatch.setattr(LoopbackClient, "request", dying(LoopbackClient.request, 20, error))
     run = failed(requesting(config, warmup=0).but(t_nom_s=(2.0,)), tmp_path, ServerDied, "pid 7")
     assert run.manifest["state"] == "failed"
     assert {*outcomes(run)} == {"stream-error"}
