@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from s2a_bench.errors import UsageError
 from s2a_bench.options import option
 from s2a_bench.policy import Floats, Plans, Policy, Schedule
+from s2a_bench.policy.metrics import stalls
 
 EPSILON: Final = 0.01
 """Share of plans that may stall."""
@@ -130,17 +131,7 @@ def no_promise(calibrations: Mapping[str, Mapping[str, Any]]) -> str:
 
 def scores(policy: Policy, plans: Plans) -> Floats:
     """Return each plan's score, shape (M,): the least caution of GRID from which on it has no stall, else infinity."""
-    count = plans.arrival_s.shape[1]
-    score = np.full(count, GRID[0])
-    left = np.arange(count)
-    above = math.inf
-    for caution in reversed(GRID):  # a plan that has stalled needs no lower caution
-        stalls = stalled(policy.informed(caution=caution).schedule(take(plans, left)))
-        score[left[stalls]] = above
-        left, above = left[~stalls], caution
-        if not left.size:
-            break
-    return score
+    return _least(np.stack([stalled(policy.informed(caution=caution).schedule(plans)) for caution in GRID]))
 
 
 def check(plans: int, epsilon: float = EPSILON) -> None:
@@ -272,11 +263,11 @@ class TrackedPolicy:
         count = plans.arrival_s.shape[1]
         for places in np.array_split(np.arange(count), -(-count // AT_ONCE)):
             every = self.base.schedules(take(plans, places), CAUTIONS)
-            stalls = stalled(every)
+            stall = stalled(every)
             ranks = np.empty(places.size, dtype=np.intp)
-            for place, score in enumerate(_least(stalls)):
+            for place, score in enumerate(_least(stall).tolist()):
                 ranks[place] = CAUTIONS.index(self.tracker.caution)
-                self.tracker.learn(score, stalled=bool(stalls[ranks[place], place]))
+                self.tracker.learn(score, stalled=bool(stall[ranks[place], place]))
             cautions += [CAUTIONS[rank] for rank in ranks]
             columns = np.arange(places.size)
             starts.append(every.start_s[:, ranks, columns])
@@ -284,11 +275,11 @@ class TrackedPolicy:
         return np.array(cautions), Schedule(np.concatenate(starts, axis=1), np.concatenate(durations, axis=1))
 
 
-def _least(stalls: NDArray[np.bool_]) -> list[float]:
-    """Return each plan's score: the least lambda from which on it does not stall."""
-    above = len(CAUTIONS) - np.argmax(stalls[::-1], axis=0)
-    ranks = np.where(stalls.any(axis=0), above, 0)
-    return [CAUTIONS[min(rank, len(CAUTIONS) - 1)] for rank in ranks]
+def _least(stall: NDArray[np.bool_]) -> Floats:
+    """Return each plan's score from whether it stalls at each of GRID, or of CAUTIONS."""
+    above = len(stall) - np.argmax(stall[::-1], axis=0)
+    ranks = np.where(stall.any(axis=0), above, 0)
+    return np.array(CAUTIONS)[np.minimum(ranks, len(CAUTIONS) - 1)]
 
 
 def upper_bound(stalled: float, plans: float, confidence: float) -> float:
@@ -305,8 +296,6 @@ def interval(seen: float, of: float) -> tuple[float, float]:
 
 def stalled(schedule: Schedule) -> NDArray[np.bool_]:
     """Return a mask of the plans with any stall, shape (M,)."""
-    from s2a_bench.policy.metrics import stalls
-
     return np.asarray((stalls(schedule) > ANY_STALL_S).any(axis=0))
 
 

@@ -125,20 +125,18 @@ def fluidity(stalls_s: Floats, nominal_s: Floats, tolerance_s: float = TOLERANCE
     return np.asarray(met / (met + missed))
 
 
-def speed_profile(
-    start_s: Floats, duration_s: Floats, nominal_s: Floats, sample_s: float, ramp_s: float = RAMP_S
-) -> Floats:
+def speed_profile(start_s: Floats, duration_s: Floats, nominal_s: Floats, sample_s: float) -> Floats:
     """Return the speed of one timeline, over the planned speed, every ``sample_s`` from s_1 until the robot rests.
 
     The arrays have the shape (N,). This is a model, and reports name it: the robot moves at T_nom / d while a skill
     takes d instead of T_nom, without a pause between skills, and rests while it stalls. Two moving averages over
-    ``ramp_s`` limit the jerk: from rest to full speed in 2 ramp_s with a peak acceleration of 1 / ramp_s and a jerk of
-    1 / ramp_s^2.
+    `RAMP_S` limit the jerk: from rest to full speed in 2 RAMP_S with a peak acceleration of 1 / RAMP_S and a jerk of
+    1 / RAMP_S^2.
     """
     edges = np.stack([start_s, start_s + duration_s], axis=1).ravel() - start_s[0]
     way = np.repeat(np.cumsum(nominal_s), 2)
     way[0], way[2::2] = 0.0, way[1:-1:2]
-    size = max(round(ramp_s / sample_s), 1)
+    size = max(round(RAMP_S / sample_s), 1)
     cells = int(np.ceil(edges[-1] / sample_s - 1e-9))  # no last cell from rounding alone
     at_s = np.arange(cells + 1) * sample_s
     speed = np.diff(np.interp(at_s, edges, way)) / sample_s  # cell means: edges are not rounded to samples
@@ -153,19 +151,12 @@ def jerk(speed_mps: Floats, sample_s: float) -> Floats:
     return np.diff(np.asarray(speed_mps, dtype=np.float64), 2) / sample_s**2
 
 
-def rms_jerk(speed_mps: Floats, sample_s: float) -> float:
-    return float(np.sqrt(np.mean(jerk(speed_mps, sample_s) ** 2)))
-
-
-def peak_jerk(speed_mps: Floats, sample_s: float) -> float:
-    return float(np.abs(jerk(speed_mps, sample_s)).max())
-
-
 def motion(speed_mps: Floats, sample_s: float) -> dict[str, float]:
     """Return jerk and smoothness of a speed profile by the columns of rows."""
+    jerks = jerk(speed_mps, sample_s)
     return {
-        "rms_jerk": rms_jerk(speed_mps, sample_s),
-        "peak_jerk": peak_jerk(speed_mps, sample_s),
+        "rms_jerk": float(np.sqrt(np.mean(jerks**2))),
+        "peak_jerk": float(np.abs(jerks).max()),
         "sparc": sparc(speed_mps, sample_s),
     }
 

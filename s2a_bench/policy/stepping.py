@@ -6,9 +6,10 @@ The simulated robot adds no delay: a skill starts when the policy decides, and r
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
@@ -26,12 +27,10 @@ class Stream:
     arrival_s: Sequence[float]
     timings: Sequence[Timing]
 
-    def instants(self) -> list[tuple[float, list[tuple[int, int]]]]:
-        """List each instant with its events (kind, index): tokens are of kind 0, fragments 1, the end 2."""
+    def events(self) -> list[tuple[float, int, int]]:
+        """List the events (time, kind, index) in their order: tokens are of kind 0, fragments 1, the end 2."""
         events = [(at, 0, i) for i, at in enumerate(self.token_s)] + [(at, 1, i) for i, at in enumerate(self.arrival_s)]
-        events.append((max(events)[0], 2, 0))
-        grouped = groupby(sorted(events), key=lambda event: event[0])
-        return [(at_s, [(kind, index) for _, kind, index in group]) for at_s, group in grouped]
+        return sorted([*events, (max(events)[0], 2, 0)])
 
 
 @dataclass(slots=True)
@@ -45,8 +44,8 @@ class _Robot:
     arrived: int = 0
     ended: bool = False
 
-    def receive(self, now_s: float, events: list[tuple[int, int]]) -> None:
-        for kind, index in events:
+    def receive(self, events: Iterable[tuple[float, int, int]]) -> None:
+        for now_s, kind, index in events:
             if kind == 0:
                 self.stepper.token(now_s)
             elif kind == 1:
@@ -90,10 +89,10 @@ def follow(stepper: Stepper, stream: Stream, n_skills: int) -> tuple[list[float]
     """Run a stepper on a stream that should have ``n_skills`` and return starts and durations in s."""
     robot = _Robot(stepper, stream, n_skills)
     wake_s = robot.act(0.0)
-    for at_s, events in stream.instants():
+    for at_s, events in groupby(stream.events(), key=itemgetter(0)):
         while wake_s < at_s:
             wake_s = robot.act(wake_s)
-        robot.receive(at_s, events)
+        robot.receive(events)
         wake_s = robot.act(at_s)
     while wake_s < math.inf:
         wake_s = robot.act(wake_s)

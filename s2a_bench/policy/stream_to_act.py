@@ -35,6 +35,7 @@ from pydantic import Field
 
 from s2a_bench.policy import CAUTION, Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
 from s2a_bench.policy.changes import ChangeWatch
+from s2a_bench.policy.conformal import take
 from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
 from s2a_bench.policy.nominal import Clairvoyant
 
@@ -83,7 +84,6 @@ class StreamToAct(Policy):
         return schedule(self.prior, self._lambda, plans, self.rule)
 
     def schedules(self, plans: Plans, cautions: Sequence[float]) -> Schedule:
-        from s2a_bench.policy.conformal import take
         from s2a_bench.policy.online import schedule
 
         count = plans.arrival_s.shape[1]

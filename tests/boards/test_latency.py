@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
-from s2a_bench.boards.latency import STRETCH, Ints, draw_ns, read_delays, read_latency, sequence_ns
+from s2a_bench.boards.latency import STRETCH, Ints, draw_ns, read_latency, sequence_ns
 from s2a_bench.errors import UsageError
 
 MS = 1_000_000
@@ -53,12 +53,14 @@ def test_bimodal_latencies_are_pauses_that_come_alread() -> None:
         ("observation_ns,received_ns,d\n10,30,0\n20,25,0\n", [20, 5]),
     ],
 )
-def test_a_csv_file_is_played_in_its_order(text: str, expected: list[int], tmp_path: Path) -> None:
+def test_a_csv_file_is_played_in_its_order_and_starts_over_at_its_end(
+    text: str, expected: list[int], tmp_path: Path
+) -> None:
     file = tmp_path / "delays.csv"
     file.write_text(text)
-    assert read_delays(file).tolist() == expected
-    found = read(str(file))
-    assert found.tolist() == expected
+    recorded = read(str(file))
+    assert recorded.tolist() == expected
+    assert list(islice(sequence_ns(recorded), 2 * len(expected))) == expected * 2
 
 
 @pytest.mark.parametrize(
@@ -77,7 +79,7 @@ def test_a_csv_file_that_is_wrong_is_named_with_its_line(text: str, message: str
     file = tmp_path / "delays.csv"
     file.write_text(text)
     with pytest.raises(UsageError, match=r"`latency`: .*delays.csv") as error:
-        read_delays(file)
+        read_latency(str(file))
     assert message in str(error.value)
 
 
@@ -113,9 +115,3 @@ def test_successive_values_of_a_family_that_remembers_follow_one_another() -> No
     spans = list(islice(sequence_ns(read(BURSTS)), 40))
     first = next(place for place, span in enumerate(spans) if span > 20 * MS)
     assert [span > 20 * MS for span in spans[first : first + 12]] == [True, False, False, False] * 3
-
-
-def test_a_recording_starts_over_at_its_end(tmp_path: Path) -> None:
-    file = tmp_path / "delays.csv"
-    file.write_text("latency_ms\n1\n2\n3\n")
-    assert list(islice(sequence_ns(read(str(file))), 7)) == [MS, 2 * MS, 3 * MS, MS, 2 * MS, 3 * MS, MS]

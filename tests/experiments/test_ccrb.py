@@ -9,7 +9,6 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
@@ -21,6 +20,7 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import MARK, NO_SCORE
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 
 GRID = {"phase": True, "phase_points": (21, 13)}
 
@@ -29,13 +29,18 @@ GRID = {"phase": True, "phase_points": (21, 13)}
 def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., StoredRun]:
     @cache
     def make(**options: Any) -> StoredRun:
-        with RunProgress() as progress:
-            return read_run(run_ccrb(CcrbComputed(**options), tmp_path_factory.mktemp("runs"), progress))
+        return read_run(run_ccrb(CcrbComputed(**options), tmp_path_factory.mktemp("runs"), NullProgress()))
 
     return make
 
 
-def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
+@pytest.fixture(scope="module")
+def diagram(made: Callable[..., StoredRun]) -> StoredRun:
+    """The operating point and its phase diagram."""
+    return made(**GRID)
+
+
+def scenes_of(run: StoredRun, gap: str = "stop", study: str = "phase") -> pd.DataFrame:
     return Rollouts.of(run).studies[study][gap]
 
 
@@ -49,12 +54,11 @@ def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..
 
 
 def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_and_waiting_is_never_better(
-    made: Callable[..., StoredRun],
+    diagram: StoredRun,
 ) -> None:
-    run = made(**GRID)
-    low, high = rate_span(scenes_of(run, "phase", "stop"), 14.0) or (0.0, 0.0)
+    scenes = scenes_of(diagram)
+    low, high = rate_span(scenes, 14.0) or (0.0, 0.0)
     assert 4.0 <= low <= 4.8 <= high <= 6.5
-    scenes = scenes_of(run, "phase", "stop")
     assert share_of(scenes, "paper").value < 0.15
     assert share_of(scenes, "wait_worse").value > 0.3
     assert share_of(scenes, "wait_better").k == 0
@@ -62,10 +66,9 @@ def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_and_wa
 
 @pytest.mark.parametrize("gap", GAPS)
 def test_acting_at_once_is_better_more_often_and_the_ordering_next_to_nowhere_unless_gaps_brake(
-    made: Callable[..., StoredRun], gap: str
+    diagram: StoredRun, gap: str
 ) -> None:
-    run = made(**GRID)
-    scenes = scenes_of(run, "phase", gap)
+    scenes = scenes_of(diagram, gap)
     assert share_of(scenes, "naive_better").k > share_of(scenes, "naive_worse").k
     if gap != "stop":
         assert rate_span(scenes, 14.0) is None
@@ -77,8 +80,8 @@ def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable
     point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
     assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
-    assert rate_span(scenes_of(run, "phase", "stop"), 14.0) is None
-    assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.02
+    assert rate_span(scenes_of(run), 14.0) is None
+    assert share_of(scenes_of(run), "paper").value < 0.02
 
 
 @pytest.mark.parametrize(("follower", "passes"), [("careful", True), ("hdm", True), ("idm", True), ("hybrid", False)])
@@ -94,17 +97,19 @@ def test_a_rear_outcome_behind_which_no_ego_is_safe_says_nothing(
     assert NO_SCORE in table.notes
 
 
-def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[..., StoredRun]) -> None:
-    runs = made(**GRID), made(scenario=CcrbOptions(follower="hybrid"), **GRID)
-    careful, hybrid = (share_of(scenes_of(run, "phase", "stop"), "survives").value for run in runs)
+def test_the_diagram_says_where_the_follower_passes_its_check(
+    made: Callable[..., StoredRun], diagram: StoredRun
+) -> None:
+    runs = diagram, made(scenario=CcrbOptions(follower="hybrid"), **GRID)
+    careful, hybrid = (share_of(scenes_of(run), "survives").value for run in runs)
     assert hybrid < 0.3
     assert careful > 0.7
-    rows = {row[0]: row[1] for row in show(runs[0]).tables["phase"].rows}
+    rows = {row[0]: row[1] for row in show(diagram).tables["phase"].rows}
     assert rows["follower survives fast tokens"] == f"{careful:.1%}"
 
 
 def test_in_random_scenarios_the_ordering_is_rare_and_waiting_is_worse(made: Callable[..., StoredRun]) -> None:
-    scenes = scenes_of(made(random=150), "random", "stop")
+    scenes = scenes_of(made(random=150), study="random")
     assert len(scenes) == 150
     paper, worse, better = (share_of(scenes, name) for name in ("paper", "wait_worse", "wait_better"))
     assert paper.interval[1] < 0.1
@@ -120,29 +125,24 @@ def test_random_scenarios_repeat_by_their_seed() -> None:
     assert again[0] == again[1] != again[2]
 
 
-def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callable[..., StoredRun]) -> None:
-    run = made(**GRID)
+def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(diagram: StoredRun) -> None:
     columns = ["wait-then-act", "stream-to-act"]
-    first = scenes_of(run, "phase", "stop")[columns]
     for gap in GAPS[1:]:
-        assert scenes_of(run, "phase", gap)[columns].equals(first)
+        assert scenes_of(diagram, gap)[columns].equals(scenes_of(diagram)[columns])
 
 
-def test_the_findings_name_every_gap_behaviour(made: Callable[..., StoredRun]) -> None:
-    run = made(**GRID)
-    lines = [finding(gap, scenes_of(run, "phase", gap), 14.0) for gap in GAPS]
+def test_the_findings_name_every_gap_behaviour(diagram: StoredRun) -> None:
+    lines = [finding(gap, scenes_of(diagram, gap), 14.0) for gap in GAPS]
     assert [line.split(":")[0] for line in lines] == list(GAPS)
     assert "holds nowhere" in lines[GAPS.index("hold")]
-    assert rate_span(scenes_of(run, "phase", "hold")) is None
 
 
-def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: Callable[..., StoredRun]) -> None:
-    run = made(**GRID)
-    scenes = scenes_of(run, "phase", "stop")
+def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(diagram: StoredRun) -> None:
+    scenes = scenes_of(diagram)
     named = region_of(scenes)
     assert named.count("paper") == share_of(scenes, "paper").k > 0
     assert {"wait", "nobody", "all"} <= set(named)
-    figures = show(run).figures
+    figures = show(diagram).figures
     assert len(figures["phase"]().axes) == len(GAPS)
     assert len(figures["scenario"]().axes) == 9
 

@@ -9,7 +9,6 @@ import jsonschema
 import numpy as np
 import pytest
 
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.live import run_live, run_live_loop
@@ -22,6 +21,7 @@ from s2a_bench.scenario import SIMULATORS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Request, Token
@@ -41,8 +41,7 @@ def replayed(profile: str) -> DrivingRequests:
 
 def drive(requests: DrivingRequests, folder: Path) -> StoredRun:
     config = CcrbLive(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, requests=requests)
-    with RunProgress() as progress:
-        return read_run(run_live(config, folder, progress))
+    return read_run(run_live(config, folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +55,7 @@ def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Sto
     assert len(token_ns) == N * L
     arrivals_ns = token_ns[L - 1 :: L]
     skills = paced.table(SKILLS)
+    assert list(skills["text"][:N]) == ["set_speed(33.3)", "set_speed(16.7)", "set_speed(0)"]  # whatever was written
     by_policy = {cell.rsplit("/", 1)[1]: rows for cell, rows in skills.groupby("cell", sort=False)}
     assert list(by_policy) == ["naive", "wait-then-act", "stream-to-act"]
     for rows in by_policy.values():
@@ -65,10 +65,6 @@ def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Sto
         starts_ns.append(max(int(arrival_ns), starts_ns[-1] + T_NS))
     assert by_policy["naive"]["start_ns"].to_numpy() == pytest.approx(starts_ns, abs=4)
     assert by_policy["wait-then-act"]["start_ns"].iloc[0] == pytest.approx(arrivals_ns[-1], abs=2)
-
-
-def test_what_is_driven_is_the_scenarios_plan_and_not_the_models(paced: StoredRun) -> None:
-    assert list(paced.table(SKILLS)["text"][:N]) == ["set_speed(33.3)", "set_speed(16.7)", "set_speed(0)"]
 
 
 def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: StoredRun) -> None:
@@ -126,9 +122,8 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
                 yield token
 
     monkeypatch.setattr(LoopbackClient, "request", cut)
-    with pytest.raises(
-        TransportError, match=r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
-    ):
+    message = r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
+    with pytest.raises(TransportError, match=message):
         drive(replayed(fast_board), tmp_path / "runs")
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L
@@ -149,8 +144,7 @@ def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
         simulator="stand-in",
         ego=ego,
     )
-    with RunProgress() as progress:
-        run = read_run(run_live_loop(config, tmp_path, progress))
+    run = read_run(run_live_loop(config, tmp_path, NullProgress()))
     (world,) = RosSimulator.opened
     driven = run.table(ROLLOUTS).query("study == 'point'")
     assert list(driven["simulator"]) == ["stand-in"]

@@ -14,7 +14,6 @@ import pandas as pd
 import pytest
 
 from s2a_bench.act.events import AbortRequested, Event, Requested, StreamEnded, VirtualInbox
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, DrivingRequests
@@ -35,6 +34,7 @@ from s2a_bench.scenario.ccrb.studies import draw
 from s2a_bench.scenario.embedded import Embedded
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Piece, Request
 
@@ -44,9 +44,8 @@ def scenario(number: int) -> CcrbClosedLoop:
     at: dict[str, Any] = {
         name: values[number].item() for name, values in draw(np.random.default_rng(45), 20).numbers.items()
     }
-    numbers = {
-        name: at[name] for name in ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "n_skills", "t_nom_s")
-    }
+    same = ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "n_skills", "t_nom_s")
+    numbers = {name: at[name] for name in same}
     options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % len(GAPS)])
     return CcrbClosedLoop(
         rate=at["tokens_per_s"], prompt_s=at["prompt_s"], tokens_per_skill=at["tokens_per_skill"], scenario=options
@@ -57,9 +56,10 @@ def driven(ready: Prepared, name: str) -> Driven:
     return drive(Longitudinal(), ready.scenario.cars, ready.scenario.driving, ready.schedules[name])
 
 
-def differ_m(one: Driven, other: Driven) -> float:
-    names = ("min_front_gap_m", "min_rear_gap_m")
-    return max(abs(float(getattr(one.outcomes, name)[0] - getattr(other.outcomes, name)[0])) for name in names)
+def check_alike(looped: Driven, expected: Driven, within_m: float) -> None:
+    assert looped.outcomes.name(0) == expected.outcomes.name(0)
+    for name in ("min_front_gap_m", "min_rear_gap_m"):
+        assert getattr(looped.outcomes, name) == pytest.approx(getattr(expected.outcomes, name), abs=within_m)
 
 
 @pytest.mark.parametrize("number", range(6))
@@ -67,11 +67,8 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     config = scenario(number)
     ready, name = resolve(config).ready, COMPARED[number % 3]
     looped = replayed(config.scenario, Embedded(), ready.policies[name], ready.plans)
-    expected = driven(ready, name)
-    assert looped.record.outcome == "completed"
-    assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
-    assert differ_m(looped.driven, expected) < 0.03
-    assert looped.real_time_factor == 1.0
+    check_alike(looped.driven, driven(ready, name), 0.03)
+    assert (looped.record.outcome, looped.real_time_factor) == ("completed", 1.0)
 
 
 def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_roll_out() -> None:
@@ -96,15 +93,12 @@ def test_a_step_as_on_the_clock_changes_gaps_by_decimetres_at_most(number: int) 
     ready, world.step_s = resolve(config).ready, 0.02
     for name in COMPARED:
         looped = replayed(config.scenario, world, ready.policies[name], ready.plans)
-        expected = driven(ready, name)
-        assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
-        assert differ_m(looped.driven, expected) < 0.2
+        check_alike(looped.driven, driven(ready, name), 0.2)
 
 
 def run(folder: Path, profile: str = "jetson-agx-orin", **options: Any) -> StoredRun:
     requests = DrivingRequests(transports="loopback", engine=EngineConfig(name="replay", profile=profile))
-    with RunProgress() as progress:
-        return read_run(run_live_loop(CcrbLiveLoop(requests=requests, **options), folder, progress))
+    return read_run(run_live_loop(CcrbLiveLoop(requests=requests, **options), folder, NullProgress()))
 
 
 def by_study(stored: StoredRun, study: str) -> pd.DataFrame:

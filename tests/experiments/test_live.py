@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +74,34 @@ def live(config: TimelineLive, output: Path) -> tuple[StoredRun, Watched]:
     return read_run(run_live(config, output / "runs", view)), view
 
 
-def check(run: StoredRun, transport: str) -> None:
-    """Check what holds of every live run that went well."""
+def failed(config: TimelineLive, output: Path, error: type[BaseException], match: str = "") -> StoredRun:
+    """Run, expecting an error, and return the folder that is kept."""
+    view = Watched()
+    with pytest.raises(error, match=match):
+        run_live(config, output / "runs", view)
+    return read_run(view.folder)
+
+
+def dying(stream: Callable[..., Iterable[Token]], tokens: int, error: Exception) -> Callable[..., Iterator[Token]]:
+    """Return a stream that breaks after so many tokens."""
+
+    def dies(*given: object) -> Iterator[Token]:
+        for token in stream(*given):
+            if token.index == tokens:
+                raise error
+            yield token
+
+    return dies
+
+
+def outcomes(run: StoredRun) -> list[str]:
+    return [execution["outcome"] for execution in run.manifest["executions"].values()]
+
+
+def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineLive, tmp_path: Path) -> None:
+    run, view = live(config, tmp_path)
     assert run.manifest["state"] == "finished"
-    assert [found["outcome"] for found in run.manifest["executions"].values()] == ["completed"] * 3
+    assert outcomes(run) == ["completed"] * 3
     cells = timelines_of(run)
     assert [cell.policy for cell in cells] == list(THREE)
     _, wait, _ = cells
@@ -94,19 +118,14 @@ def check(run: StoredRun, transport: str) -> None:
         assert all(re.fullmatch(r"\w+\(\w+(, \w+)?\)", skill.text) for skill in cell.skills)
     assert wait.skills[0].start_ns >= wait.skills[-1].arrival_ns
     assert len({tuple(skill.text for skill in cell.skills) for cell in cells}) == 1
-    assert run.manifest["live"]["transport"] == transport
+    assert run.manifest["live"]["transport"] == "loopback"
     assert run.manifest["start_jitter"]["starts"] == 24
     jsonschema.validate(timelines_json(run, cells), SCHEMA)
-
-
-def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineLive, tmp_path: Path) -> None:
-    run, view = live(config, tmp_path)
-    check(run, "loopback")
     assert run.manifest["live"]["emulated"] is True
     assert [len(scene.records) for scene in view.scenes] == [3]
-    (note,) = origin_notes(run.manifest, timelines_of(run))
+    (note,) = origin_notes(run.manifest, cells)
     assert note.startswith("EMULATED tokens over loopback, parsed and executed as they arrive")
-    assert list(timeline_figures(timelines_of(run), ())) == ["timeline"]
+    assert list(timeline_figures(cells, ())) == ["timeline"]
     assert run.samples["warmup"].tolist() == [True, False]
     warm_ns = run.tokens["client_ns"].iloc[:48]
     assert run.manifest["prior"]["mean_s"] == pytest.approx((warm_ns.iloc[-1] - warm_ns.iloc[0]) / 47e9)
@@ -150,12 +169,10 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
     engine = EngineConfig(threads=1, pace=60.0)
     changed = requesting(config, engine=engine, transports="http", timeout_s=120.0, requests=2)
     changed = changed.but(t_nom_s=(0.05,), task="Tidy up.")
-    view = Watched()
-    run = read_run(run_live(changed, tmp_path / "runs", view))
-    outcomes = [found["outcome"] for found in run.manifest["executions"].values()]
-    assert outcomes == ["completed"] * 6
-    live = run.manifest["live"]
-    assert (live["engine"], live["emulated"], live["dummy"], live["paced_tokens_per_s"]) == ("llama", False, True, 60.0)
+    run, _ = live(changed, tmp_path)
+    assert outcomes(run) == ["completed"] * 6
+    facts = [run.manifest["live"][name] for name in ("engine", "emulated", "dummy", "paced_tokens_per_s")]
+    assert facts == ["llama", False, True, 60.0]
     cells = timelines_of(run)
     assert {(cell.first.emulated, cell.first.tokens_per_s, len(cell)) for cell in cells} == {(False, 60.0, 2)}
     assert (run.tokens.groupby("request_id").size() == 48).all()
@@ -170,25 +187,14 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
 def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
 ) -> None:
-    whole = ReplayEngine.generate
-
-    def dies(self: ReplayEngine, request: Request) -> Iterator[Token]:
-        for token in whole(self, request):
-            if token.index == tokens:
-                raise EngineError("the board fell off the robot")
-            yield token
-
-    monkeypatch.setattr(ReplayEngine, "generate", dies)
-    changed = requesting(config, warmup=0)
-    view = Watched()
-    with pytest.raises(TransportError, match="no request of loopback succeeded"):
-        run_live(changed, tmp_path / "runs", view)
-    run = read_run(view.folder)
+    error = EngineError("the board fell off the robot")
+    monkeypatch.setattr(ReplayEngine, "generate", dying(ReplayEngine.generate, tokens, error))
+    run = failed(requesting(config, warmup=0), tmp_path, TransportError, "no request of loopback succeeded")
     assert run.manifest["state"] == "failed"
     assert run.samples["error"].tolist() == ["RequestFailed: the board fell off the robot"]
     executions = run.manifest["executions"]
     codes = [warning["code"] for warning in run.manifest["warnings"]]
-    assert [found["outcome"] for found in executions.values()] == ["stream-error"] * 3
+    assert outcomes(run) == ["stream-error"] * 3
     assert codes.count("plan-stream-error") == 1
     assert {found["arrived"] for found in executions.values()} == {tokens // 6}
     assert next(found["started"] for name, found in executions.items() if "wait-then-act" in name) == 0
@@ -199,22 +205,11 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
     config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = LoopbackClient.request
-
-    def dies(self: LoopbackClient, request: Request, trace: Trace) -> Iterator[Token]:
-        for token in whole(self, request, trace):
-            if token.index == 20:
-                raise ServerDied("the server (pid 7) died, killed by signal 9")
-            yield token
-
-    monkeypatch.setattr(LoopbackClient, "request", dies)
-    view = Watched()
-    changed = requesting(config, warmup=0).but(t_nom_s=(2.0,))
-    with pytest.raises(ServerDied, match="pid 7"):
-        run_live(changed, tmp_path / "runs", view)
-    run = read_run(view.folder)
+    error = ServerDied("the server (pid 7) died, killed by signal 9")
+    monkeypatch.setattr(LoopbackClient, "request", dying(LoopbackClient.request, 20, error))
+    run = failed(requesting(config, warmup=0).but(t_nom_s=(2.0,)), tmp_path, ServerDied, "pid 7")
     assert run.manifest["state"] == "failed"
-    assert {found["outcome"] for found in run.manifest["executions"].values()} == {"stream-error"}
+    assert {*outcomes(run)} == {"stream-error"}
     skills = run.table(SKILLS)
     assert len(skills[skills["cell"].str.endswith("/naive")]) == 1
     assert (skills["end_ns"] - skills["start_ns"] >= 1.6e9 - 1e6).all()
@@ -232,11 +227,7 @@ def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
         return whole(self, trace)
 
     monkeypatch.setattr(RequestFeed, "capture", breaks)
-    view = Watched()
-    with pytest.raises(SourceError, match="pulled out"):
-        run_live(config, tmp_path / "runs", view)
-    outcomes = {found["outcome"] for found in read_run(view.folder).manifest["executions"].values()}
-    assert outcomes == {"stream-error"}
+    assert {*outcomes(failed(config, tmp_path, SourceError, "pulled out"))} == {"stream-error"}
 
 
 def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineLive, tmp_path: Path) -> None:
@@ -258,23 +249,16 @@ def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineLi
         signal.signal(signal.SIGALRM, before)
     run = read_run(view.folder)
     assert run.manifest["state"] == "interrupted"
-    assert {found["outcome"] for found in run.manifest["executions"].values()} == {"aborted"}
+    assert {*outcomes(run)} == {"aborted"}
     assert all(scene.records[0].outcome == "aborted" for scene in view.scenes)
 
 
 def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None:
-    played = TimelineRealTime(
-        profiles=(fast_board,),
-        tokens_per_skill=(6, 2),
-        t_nom_s=(0.03,),
-        policies=(*THREE, "s2a-clairvoyant"),
-    )
-    view = Watched()
-    run = read_run(run_real_time(played, tmp_path / "runs", view))
+    policies = (*THREE, "s2a-clairvoyant")
+    played = TimelineRealTime(profiles=(fast_board,), tokens_per_skill=(6, 2), t_nom_s=(0.03,), policies=policies)
+    run = read_run(run_real_time(played, tmp_path / "runs", Watched()))
     cells = timelines_of(run)
-    assert [(cell.first.tokens_per_skill, cell.policy) for cell in cells] == [
-        (length, name) for length in (6, 2) for name in (*THREE, "s2a-clairvoyant")
-    ]
+    assert [(cell.first.tokens_per_skill, cell.policy) for cell in cells] == [*product((6, 2), policies)]
     assert {(cell.first.mode, cell.first.emulated) for cell in cells} == {("real-time", True)}
     naive, wait, _, clairvoyant = cells[:4]
     # t_i = .05 + i / 20 s at least: a real clock is never early.
@@ -298,10 +282,7 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
         ({"robot": "ros"}, "`robot`: ros follows one policy at a time"),
         ({"tokens_per_skill": (4,)}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
         ({"skills": "driving"}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
-        (
-            {"requests": {"transports": "http,ros"}},
-            "`transport`: one stream is followed, not http",
-        ),
+        ({"requests": {"transports": "http,ros"}}, "`transport`: one stream is followed, not http"),
     ],
 )
 def test_what_makes_no_sense_is_named(config: TimelineLive, fields: dict[str, Any], message: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from s2a_bench.boards.gaps import Constant, Lognormal, Markov, Recorded
 from s2a_bench.boards.profile import Profile
 from s2a_bench.boards.tokens import board_of_profile, gaps_of
 from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.experiments.timeline.build_rows import timeline_rows
+from s2a_bench.experiments.timeline.build_rows import share, timeline_rows
 from s2a_bench.experiments.timeline.config import TimelineComputed
-from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES, TimelineRow
 from s2a_bench.experiments.timeline.run import recordings, run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import show
@@ -35,7 +35,6 @@ from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.made_runs import marks_of, row_of
 
-ORIN = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
 JITTERY = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
 
 
@@ -54,10 +53,8 @@ def test_every_policy_meets_the_same_arrivals(tmp_path: Path) -> None:
 def test_a_seed_repeats_a_run_and_another_seed_does_not(tmp_path: Path) -> None:
     texts = []
     for place, seed in enumerate((3, 3, 4)):
-        config = TimelineComputed(
-            rates=(4.8,), profiles=(), tokens_per_skill=(6,), jitter="lognormal:cv=0.2", plans=5, seed=seed
-        )
-        texts.append((ran(config, tmp_path / str(place)).path / "skills.csv").read_text())
+        run = ran(JITTERY.but(plans=5, seed=seed), tmp_path / str(place))
+        texts.append((run.path / "skills.csv").read_text())
     assert texts[0] == texts[1] != texts[2]
 
 
@@ -81,14 +78,7 @@ def test_skills_stalls_and_metrics_of_a_plan_fit_together(tmp_path: Path) -> Non
 
 
 def test_stream_to_act_keeps_its_promise_where_naive_and_the_mean_rule_stall(tmp_path: Path) -> None:
-    config = TimelineComputed(
-        policies=("naive", "s2a-mean", "stream-to-act"),
-        profiles=("jetson-agx-orin",),
-        tokens_per_skill=(6,),
-        jitter="profile",
-        plans=1000,
-    )
-    run = ran(config, tmp_path)
+    run = ran(JITTERY.but(policies=("naive", "s2a-mean", "stream-to-act"), plans=1000), tmp_path)
     share = {cell.policy: cell.p_any_stall for cell in timelines_of(run)}
     assert share["stream-to-act"] <= 0.02
     assert share["s2a-mean"] > 0.3
@@ -108,15 +98,8 @@ def test_stream_to_act_keeps_its_promise_where_naive_and_the_mean_rule_stall(tmp
 def test_online_without_jitter_starts_at_the_safe_start_exactly(
     rate: float, prompt_s: float, tokens: int, skills: int, t_nom_s: float
 ) -> None:
-    config = TimelineComputed(
-        profiles=(),
-        rates=(rate,),
-        prompt_s=prompt_s,
-        tokens_per_skill=(tokens,),
-        n_skills=(skills,),
-        t_nom_s=(t_nom_s,),
-    )
-    (case,) = config.cases
+    plan = {"tokens_per_skill": (tokens,), "n_skills": (skills,), "t_nom_s": (t_nom_s,)}
+    (case,) = TimelineComputed(profiles=(), rates=(rate,), prompt_s=prompt_s, **plan).cases
     _, plans = draw(case, 0, 1, "plans")
     schedule = learn(case, LearningPlan({"online": StreamToAct()}, 0)).by_name["online"].schedule(plans)
     safe_s = safe_start(plans.arrival_s, plans.nominal_s)
@@ -139,38 +122,25 @@ def test_drawn_tokens_have_the_rate_and_prompt_time_of_their_board() -> None:
     assert even.tokens(2, np.random.default_rng(0), 1)[:, 0] == pytest.approx([2.2, 2.4])
 
 
-def test_a_recording_is_played_where_a_profile_has_one() -> None:
-    profile = Profile("p", "P", "measured", 5.0, 1.0, 0.0, Lognormal(0.2, 0.5), trace_s=(0.1, 0.3))
-    assert board_of_profile(profile, "profile", None).gaps == Recorded(0.2, (0.1, 0.3))
-    assert board_of_profile(profile, "none", None).gaps == Constant(0.2)
-
-
-def test_a_recording_already_holds_the_spread_between_answers() -> None:
+def test_a_recording_is_played_where_a_profile_has_one_and_holds_the_spread_between_answers() -> None:
     parametric = Profile("p", "P", "measured", 5.0, 1.0, 0.0, Lognormal(0.2, 0.5), rate_cv=0.1)
-    assert board_of_profile(parametric, "profile", None).rate_cv == 0.1
-    assert board_of_profile(replace(parametric, trace_s=(0.1, 0.3)), "profile", None).rate_cv == 0
+    recorded = replace(parametric, trace_s=(0.1, 0.3))
+    boards = [board_of_profile(*each, None) for each in ((parametric, "profile"), (recorded, "profile"))]
+    assert [(board.gaps, board.rate_cv) for board in boards] == [
+        (Lognormal(0.2, 0.5), 0.1),
+        (Recorded(0.2, (0.1, 0.3)), 0),
+    ]
+    assert board_of_profile(recorded, "none", None).gaps == Constant(0.2)
 
 
 def test_jitter_is_read_with_its_parameters() -> None:
     assert gaps_of("none", 0.5) == Constant(0.5)
-    assert gaps_of("lognormal:cv=0.3", 0.5) == Lognormal(0.5, 0.3)
     text = "markov:cv=0.2,pause_share=0.02,pause_ratio=10,pause_tokens=3"
     assert gaps_of(text, 0.5) == Markov(0.5, 0.2, 0.02, 10.0, 3.0)
-
-
-@pytest.mark.parametrize(
-    ("jitter", "message"),
-    [
-        ("lognormal", "cv: is missing"),
-        ("lognormal:cv", "'cv' should be key=number"),
-        ("lognormal:cv=wide", "'cv=wide' should be key=number"),
-        ("lognormal:cv=-1", "cv: -1 should be greater than or equal to 0"),
-        ("lognormal:cv=0.2,sd=1", "sd: lognormal gaps have no such key"),
-    ],
-)
-def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        gaps_of(jitter, 0.5)
+    with pytest.raises(UsageError, match="`jitter` lognormal: cv: is missing"):
+        gaps_of("lognormal", 0.5)
+    with pytest.raises(UsageError, match="`jitter`: lognormal:cv: 'cv' should be key=number"):
+        gaps_of("lognormal:cv", 0.5)
 
 
 @pytest.mark.parametrize(
@@ -186,11 +156,14 @@ def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
         ({"jitter": "lognormal:cv=1", "plans": 10**6}, "`plans`: .* skills are more than"),
         ({"n_skills": (1000,), "tokens_per_skill": (1000,)}, "`n_skills`, `tokens_per_skill`: 1000000 tokens a plan"),
         ({"profiles": ()}, "`profiles`: name at least one"),
+        ({"policies": ("naive",), "track": True}, "`track`: no policy has a lambda to follow"),
+        ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy has a lambda to follow"),
+        ({"jitter": "none", "plans": None, "track": True}, "`track`: without `jitter` or `t_nom_cv`"),
     ],
 )
 def test_a_configuration_that_makes_no_sense_is_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        TimelineComputed(**fields)
+        JITTERY.but(**fields)
 
 
 def recorded_run(output: Path, answers: int, tokens: int, slower: int = 0) -> Path:
@@ -275,19 +248,43 @@ def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
     assert (rows["caution"].isna() == (rows["policy"] != "stream-to-act")).all()
 
 
-def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
-    config = TimelineComputed(profiles=(), rates=(0.001,), tokens_per_skill=(6,), t_nom_s=(4000.0,))
-    rows = ran(config, tmp_path).table(TIMELINES)
-    assert rows[["rms_jerk", "peak_jerk", "sparc"]].isna().all().all()
-    assert rows["stalls"].notna().all()
+def row_of_plan(arrival_s: np.ndarray, duration_s: np.ndarray) -> TimelineRow:
+    """Make the row of a plan of skills of 1 s that start as they arrive and run for ``duration_s``."""
+    nominal_s = np.ones(arrival_s.shape)
+    plans = Plans(arrival_s, nominal_s, nominal_s, nominal_s)
+    setting = PlanSetting("", "a rate", 4.0, 0.5, 1, len(arrival_s), 1.0)
+    (made,) = timeline_rows(setting, "naive", plans, Schedule(arrival_s, duration_s), ["a"])
+    return made
 
 
-def test_a_skill_that_fails_at_once_has_a_row_and_no_motion() -> None:
-    second = np.ones((1, 1))
-    setting = PlanSetting("", "live", 5.0, None, 6, 4, 1.0, mode="live", emulated=False)
-    (row,) = timeline_rows(setting, "naive", Plans(second, second, second, second), Schedule(second, 0 * second), ["a"])
-    kept = asdict(row)
-    assert (kept["start_ns"], kept["end_ns"], kept["sparc"], kept["rms_jerk"]) == (10**9, 10**9, None, None)
+@pytest.mark.parametrize(
+    ("arrival_s", "duration_s"), [([1.0], [0.0]), ([1.0, 2000.0], [1.0, 1.0])], ids=["fails at once", "long"]
+)
+def test_a_plan_without_time_or_of_hours_has_a_row_and_no_motion(
+    arrival_s: list[float], duration_s: list[float]
+) -> None:
+    row = row_of_plan(np.array([arrival_s]).T, np.array([duration_s]).T)
+    assert (row.start_ns, row.end_ns) == (10**9, round((arrival_s[-1] + duration_s[-1]) * 1e9))
+    assert {row.rms_jerk, row.peak_jerk, row.sparc} == {None}
+
+
+def test_every_metric_is_computed_and_kept_as_its_column_holds_it() -> None:
+    row = row_of_plan(np.array([[0.25], [1.5]]), np.ones((2, 1)))
+    expected = {
+        "start_ns": 250_000_000,
+        "stalls": 1,
+        "any_stall": True,
+        "stall_ns": 250_000_000,
+        "stall_ratio": round(0.25 / 2.25, 9),
+        "start_regret": 0.0,
+        "signed_start_regret": -0.5,
+    }
+    assert {name: getattr(row, name) for name in expected} == expected
+    assert {name: type(getattr(row, name)) for name in expected} == {
+        name: type(each) for name, each in expected.items()
+    }
+    assert None not in [getattr(row, metric.column) for metric in METRICS.values()]
+    assert str(share(-1e-12)) == "0.0"  # a rounding error
 
 
 def test_followed_lambda_changes_from_plan_to_plan_and_keeps_the_stalls_rare(tmp_path: Path) -> None:
@@ -326,16 +323,3 @@ def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> No
     assert found["expected"]["expected_risk"] == 4 / 401
     assert found["high-confidence"]["expected_risk"] == 1 / 401
     assert found["expected"]["caution"] <= found["high-confidence"]["caution"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"policies": ("naive",), "track": True}, "`track`: no policy has a lambda to follow"),
-        ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy has a lambda to follow"),
-        ({"jitter": "none", "plans": None, "track": True}, "`track`: without `jitter` or `t_nom_cv`"),
-    ],
-)
-def test_what_cannot_be_followed_is_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        JITTERY.but(**options)

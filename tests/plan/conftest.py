@@ -1,6 +1,3 @@
-from pathlib import Path
-
-import numpy as np
 import pytest
 from gguf import GGUFWriter
 
@@ -25,25 +22,16 @@ def of_words(tmp_path_factory: pytest.TempPathFactory) -> Tokenizer:
     path = tmp_path_factory.mktemp("vocabulary") / "words.gguf"
     vocab = make_vocab(full=True)
     writer = GGUFWriter(path, "qwen2")
-    writer.add_name("words")
     writer.add_tokenizer_model("gpt2")
     writer.add_tokenizer_pre("qwen2")
     writer.add_token_list(vocab.tokens)
     writer.add_token_types(vocab.types)
     writer.add_token_merges(vocab.merges)
-    writer.add_eos_token_id(vocab.eos)
-    writer.add_block_count(1)
-    writer.add_context_length(512)
-    writer.add_embedding_length(64)
-    writer.add_feed_forward_length(64)
-    writer.add_head_count(1)
-    writer.add_layer_norm_rms_eps(1e-6)
-    writer.add_tensor("token_embd.weight", np.zeros((1, 64), np.float32))
     writer.write_header_to_file()
     writer.write_kv_data_to_file()
     writer.write_tensors_to_file()
     writer.close()
-    return Tokenizer(Path(path))
+    return Tokenizer(path)
 
 
 @pytest.fixture(scope="session", params=["household", "driving"])

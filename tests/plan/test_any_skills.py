@@ -82,10 +82,14 @@ def test_a_format_is_exact_and_can_be_read_or_is_refused(
         assert sorted("".join(map(str, word)) for word in allowed) == sorted(
             text_of(format_, [call]) for call in skills.calls
         )
-        plan = rng.choices(skills.calls, k=n_skills)
-        parser = Parser(format_)
-        found = [event for char in text_of(format_, plan) for event in parser.feed(char)] + parser.close()
-        assert [event.call for event in found if isinstance(event, SkillParsed)] == plan
+        plan = text_of(format_, rng.choices(skills.calls, k=n_skills))
+        for answer in (plan, "".join(map(str, Gbnf(grammar(format_, n_skills)).sample(rng)))):
+            parser = Parser(format_)
+            events = [event for char in answer for event in parser.feed(char)]
+            assert parser.close() == []
+            calls = [event.call for event in events if isinstance(event, SkillParsed)]
+            assert len(calls) == len(events) == n_skills
+            assert text_of(format_, calls) == answer
         pinned = Gbnf(grammar(format_, n_skills, tokenize)).sample(rng)
         if format_ is not formats[0]:
             assert len(pinned) == tokens * n_skills

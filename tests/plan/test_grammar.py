@@ -32,19 +32,6 @@ def test_the_pinned_grammar_allows_the_counted_tokens_and_nothing_else(format_: 
     assert sorted(allowed) == sorted(tuple(tokenize(text_of(format_, [call]))) for call in format_.skills.calls)
 
 
-def test_what_the_grammar_allows_is_exactly_n_skills(format_: Format) -> None:
-    rng = random.Random(1)
-    for n_skills in (1, 3, 8, 12):
-        read = Gbnf(grammar(format_, n_skills))
-        for _ in range(20):
-            answer = "".join(map(str, read.sample(rng)))
-            parser = Parser(format_)
-            events = parser.feed(answer)
-            assert parser.close() == []
-            assert [type(event) for event in events] == [SkillParsed] * n_skills
-            assert text_of(format_, (event.call for event in events if isinstance(event, SkillParsed))) == answer
-
-
 def test_what_the_pinned_grammar_allows_is_the_tokens_of_a_plan(format_: Format, tokenize: Tokenize) -> None:
     rng = random.Random(2)
     words = {tuple(tokenize(format_.line(number, text))) for number in range(1, 9) for text in format_.texts}

@@ -13,14 +13,9 @@ from itertools import pairwise
 Seconds = Sequence[float]
 
 
-def before(durations: Seconds) -> list[float]:
-    """Add up the durations before each skill."""
-    return [sum(durations[:i]) for i in range(len(durations))]
-
-
 def safe_start(arrival: Seconds, durations: Seconds) -> float:
     """Say when to start so that every skill is there when the ones before it have run."""
-    return max(t - done for t, done in zip(arrival, before(durations), strict=True))
+    return max(t - sum(durations[:i]) for i, t in enumerate(arrival))
 
 
 def execute(arrival: Seconds, durations: Seconds, first: float) -> list[float]:

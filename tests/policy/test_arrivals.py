@@ -10,23 +10,15 @@ from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy.arrivals import fragments, recorded_plans, tokens, uniform
 
 
-def test_uniform_fragments_come_every_l_over_r_seconds_after_the_prompt() -> None:
+def test_uniform_fragments_come_every_l_over_r_seconds_after_the_prompt_of_each_plan() -> None:
     assert uniform(0.5, 6, 4.8, 3).tolist() == [[1.75], [3.0], [4.25]]
-
-
-def test_uniform_takes_one_setting_a_plan() -> None:
     assert uniform([0.0, 1.0], [2, 6], [4.0, 3.0], 2).tolist() == [[0.5, 3.0], [1.0, 5.0]]
 
 
-def test_the_first_token_comes_one_gap_after_the_prompt() -> None:
-    at_s = tokens(Constant(0.25), 3.0, 4, 2, np.random.default_rng(0))
-    assert at_s.tolist() == [[3.25, 3.25], [3.5, 3.5], [3.75, 3.75], [4.0, 4.0]]
-    assert fragments(at_s, 2).tolist() == [[3.5, 3.5], [4.0, 4.0]]
-
-
-def test_the_prompt_may_take_its_own_time_in_every_plan() -> None:
-    at_s = tokens(Constant(1.0), np.array([0.0, 5.0]), 2, 2, np.random.default_rng(0))
-    assert at_s.tolist() == [[1.0, 6.0], [2.0, 7.0]]
+def test_the_first_token_comes_one_gap_after_the_prompt_of_each_plan() -> None:
+    at_s = tokens(Constant(0.25), np.array([3.0, 5.0]), 4, 2, np.random.default_rng(0))
+    assert at_s.tolist() == [[3.25, 5.25], [3.5, 5.5], [3.75, 5.75], [4.0, 6.0]]
+    assert fragments(at_s, 2).tolist() == [[3.5, 5.5], [4.0, 6.0]]
 
 
 def test_random_tokens_are_the_running_sum_of_the_familys_gaps() -> None:

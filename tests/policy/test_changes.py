@@ -79,22 +79,17 @@ def test_detection_costs_nothing_without_a_change_and_saves_stalls_with_one() ->
     assert calibration.token_s is not None
     plain = StreamToAct(GapPrior.fit(calibration.token_s))
     calm, slow = world.draw(rng, 400), SHIFTS["rate halves in mid-plan"](world, rng, 400)
-    found = {}
+    schedules = {}
     for detect in (False, True):
         policy = replace(plain, detect=detect)
         policy = replace(policy, caution=calibrate(policy, calibration).caution)
-        starts = measure(calm, policy.schedule(calm)).start_regret.mean()
-        gaps_s = stalls(policy.schedule(slow))
-        found[detect] = (
-            starts,
-            stalled(policy.schedule(calm)).mean(),
-            stalled(policy.schedule(slow)).mean(),
-            (gaps_s > 1e-6).sum() / 400,
-        )
-    assert found[True][0] == pytest.approx(found[False][0], abs=0.02)
-    assert found[True][1] <= 0.02
-    assert found[True][2] < 0.75 * found[False][2]
-    assert found[True][3] < 0.7 * found[False][3]
+        schedules[detect] = policy.schedule(calm), policy.schedule(slow)
+    (calm_without, slow_without), (calm_with, slow_with) = schedules.values()
+    late, expected = (measure(calm, each).start_regret.mean() for each in (calm_with, calm_without))
+    assert late == pytest.approx(expected, abs=0.02)
+    assert stalled(calm_with).mean() <= 0.02
+    assert stalled(slow_with).mean() < 0.75 * stalled(slow_without).mean()
+    assert (stalls(slow_with) > 1e-6).sum() < 0.7 * (stalls(slow_without) > 1e-6).sum()
 
 
 def test_a_robot_that_cannot_make_it_holds_once_instead_of_again_and_again() -> None:

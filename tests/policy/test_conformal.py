@@ -17,6 +17,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, conformal
 from s2a_bench.policy.conformal import (
     GRID,
+    Guarantee,
     TrackedPolicy,
     Tracker,
     calibrate,
@@ -80,22 +81,19 @@ def test_a_plan_that_only_waiting_saves_scores_infinity() -> None:
     assert scores(StreamToAct(GapPrior(1 / 4.8, 0.1, 0.2)), plans)[1] == math.inf
 
 
-@pytest.mark.parametrize(("count", "may_stall"), [(99, 0), (341, 0), (342, 0), (400, 0), (1000, 7), (4000, 39)])
-def test_more_plans_allow_more_of_them_to_stall(count: int, may_stall: int) -> None:
-    found = choose(np.arange(count, dtype=float))
-    assert found.stalled == may_stall
-    assert found.caution == count - 1 - may_stall
-    assert found.expected_risk == (may_stall + 1) / (count + 1) <= 0.01
-    assert (count < 342) == (found.risk > 0.02)
-
-
-@pytest.mark.parametrize(("count", "may_stall"), [(99, 0), (400, 3), (1000, 9), (4000, 39)])
-def test_expected_means_epsilon_and_no_less(count: int, may_stall: int) -> None:
-    found = choose(np.arange(count, dtype=float), 0.01, "expected")
-    assert (found.stalled, found.guarantee) == (may_stall, "expected")
-    assert found.expected_risk == (may_stall + 1) / (count + 1)
-    assert 0.009 < found.expected_risk <= 0.01
-    assert found.caution <= choose(np.arange(count, dtype=float), 0.01).caution
+@pytest.mark.parametrize(
+    ("guarantee", "count", "may_stall"),
+    [
+        *(("high-confidence", *each) for each in ((99, 0), (341, 0), (342, 0), (400, 0), (1000, 7), (4000, 39))),
+        *(("expected", *each) for each in ((99, 0), (400, 3), (1000, 9), (4000, 39))),
+    ],
+)
+def test_more_plans_allow_more_of_them_to_stall(guarantee: Guarantee, count: int, may_stall: int) -> None:
+    known = choose(np.arange(count, dtype=float), 0.01, guarantee)
+    assert (known.guarantee, known.stalled, known.caution) == (guarantee, may_stall, count - 1 - may_stall)
+    assert known.expected_risk == (may_stall + 1) / (count + 1) <= 0.01
+    if guarantee == "high-confidence":
+        assert (count < 342) == (known.risk > 0.02)
 
 
 def test_the_promises_hold_for_scores_of_any_distribution() -> None:
@@ -263,8 +261,10 @@ def test_arrays_are_plans_one_after_another(policy: StreamToAct) -> None:
     for column, caution in enumerate(cautions):
         plan = take(plans, np.array([column]))
         assert alone.policy.caution == caution
-        np.testing.assert_array_equal(alone.policy.schedule(plan).start_s[:, 0], schedule.start_s[:, column])
-        alone.learn(plan, stalled=bool(stalled(alone.policy.schedule(plan))[0]))
+        decided = alone.policy.schedule(plan)
+        np.testing.assert_array_equal(decided.start_s[:, 0], schedule.start_s[:, column])
+        np.testing.assert_array_equal(decided.duration_s[:, 0], schedule.duration_s[:, column])
+        alone.learn(plan, stalled=bool(stalled(decided)[0]))
     assert (together.tracker.level, together.policy) == (alone.tracker.level, alone.policy)
 
 

@@ -33,33 +33,6 @@ def test_a_clairvoyant_who_is_told_nothing_is_refused() -> None:
         policy("s2a-clairvoyant").stepper(PlanShape(2, 4, SKILL))
 
 
-def test_naive_starts_at_once_and_never_holds_on() -> None:
-    stepper = policy("naive").stepper(PlanShape(3, 4, SKILL))
-    assert stepper.decide(0.0) == math.inf
-    stepper.fragment(1.0, SKILL)
-    assert stepper.decide(1.0) == Start(1.0, 1.0)
-    assert stepper.decide(2.0) == math.inf
-
-
-def test_wait_then_act_starts_with_the_last_skill_or_when_the_stream_ends_before() -> None:
-    for ends in (False, True):
-        stepper = policy("wait-then-act").stepper(PlanShape(2, 4, SKILL))
-        stepper.fragment(1.0, SKILL)
-        assert stepper.decide(1.0) == math.inf
-        if ends:
-            stepper.end(2.0)
-        else:
-            stepper.fragment(2.0, SKILL)
-        assert stepper.decide(2.0) == Start(1.0, 1.0)
-
-
-def test_clairvoyant_waits_for_its_start_with_skills_in_hand() -> None:
-    stepper = policy("s2a-clairvoyant").stepper(PlanShape(2, 4, SKILL, safe_start_s=3.0))
-    stepper.fragment(1.0, SKILL)
-    assert stepper.decide(1.0) == 3.0
-    assert stepper.decide(3.0) == Start(1.0, 1.0)
-
-
 @given(
     st.sampled_from(["naive", "wait-then-act", "s2a-clairvoyant"]),
     st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=1, max_size=7),
@@ -117,24 +90,19 @@ class AsTold(Wrong):
 
 
 @pytest.mark.parametrize(
-    ("answer", "message"),
+    ("kind", "answer", "message"),
     [
-        (0.0, "decides at 0.0 s wants to decide again at 0.0 s"),
-        (math.nan, "wants to decide again at nan s"),
-        (Start(1.0, 1.0), "starts skill 1 at 0.0 s, before it has arrived"),
+        (Wrong, 0.0, "decides at 0.0 s wants to decide again at 0.0 s"),
+        (Wrong, math.nan, "wants to decide again at nan s"),
+        (Wrong, Start(1.0, 1.0), "starts skill 1 at 0.0 s, before it has arrived"),
+        (AsTold, Start(-1.0, 2.0), "a skill that takes -1.0 s, 2.0 s at most"),
+        (AsTold, Start(2.0, 1.0), "a skill that takes 2.0 s, 1.0 s at most"),
+        (AsTold, Start(math.nan, 1.0), "a skill that takes nan s, 1.0 s at most"),
     ],
 )
-def test_what_no_robot_can_do_is_refused(answer: Start | float, message: str) -> None:
+def test_what_no_robot_can_do_is_refused(kind: type[Wrong], answer: Start | float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        follow(Wrong(answer=answer), Stream([], [1.0], [SKILL]), 1)
-
-
-@pytest.mark.parametrize(("duration_s", "latest_s"), [(-1.0, 2.0), (2.0, 1.0), (math.nan, 1.0)])
-def test_a_skill_that_takes_less_than_nothing_or_longer_than_its_bound_is_refused(
-    duration_s: float, latest_s: float
-) -> None:
-    with pytest.raises(ValueError, match=f"a skill that takes {duration_s} s, {latest_s} s at most"):
-        follow(AsTold(answer=Start(duration_s, latest_s)), Stream([], [1.0], [SKILL]), 1)
+        follow(kind(answer=answer), Stream([], [1.0], [SKILL]), 1)
 
 
 def test_a_skill_may_take_no_time_and_its_bound_may_be_less_by_a_rounding() -> None:

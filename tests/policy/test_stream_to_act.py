@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from s2a_bench.policy import Plans, PlanShape, Start, Timing, stepping
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls
-from s2a_bench.policy.schedule import safe_start
-from s2a_bench.policy.stream_to_act import EarlyStart, MeanStart, OnlineStepper, StartRule, StreamToAct
+from s2a_bench.policy.stream_to_act import EarlyStart, MeanStart, OnlineStepper, StreamToAct
 from s2a_bench.testing.policy import EXACT, draw
 from tests.conftest import examples
 
@@ -237,35 +236,11 @@ def test_steps_and_arrays_agree_whatever_is_believed_and_however_fragments_lag(
     np.testing.assert_allclose(stepped.duration_s, schedule.duration_s, rtol=0, atol=EXACT)
 
 
-def test_each_plan_may_have_its_own_caution() -> None:
-    from s2a_bench.policy.online import schedule
-
-    plans = draw(7, 6, 3, 1.4, 4)
-    cautions = [0.0, 1.0, 3.0, math.inf]
-    together = schedule(PRIOR, cautions, plans, StartRule())
-    for column, caution in enumerate(cautions):
-        alone = StreamToAct(PRIOR, caution).schedule(plans)
-        np.testing.assert_array_equal(together.start_s[:, column], alone.start_s[:, column])
-        np.testing.assert_array_equal(together.duration_s[:, column], alone.duration_s[:, column])
-
-
 def test_infinite_caution_waits_for_the_whole_plan_and_never_stalls() -> None:
     plans = draw(8, 6, 3, 1.4, 50, gap_cv=1.0)
     schedule = StreamToAct(PRIOR, math.inf).schedule(plans)
     np.testing.assert_array_equal(schedule.start_s[0], plans.arrival_s[-1])
     assert (stalls(schedule) <= EXACT).all()
-
-
-def test_without_any_spread_the_online_start_is_the_paper_s_s0() -> None:
-    prior = GapPrior(0.25, 1e-6, 1e-6)
-    token_s = 0.5 + 0.25 * np.arange(1.0, 49)[:, np.newaxis]
-    nominal_s = np.ones((8, 1))
-    shape = PlanShape(8, 6, Timing(1.0, 0.8, 1.5), expected_cv=0.0)
-    plans = Plans(token_s[5::6], nominal_s, 0.8 * nominal_s, 1.5 * nominal_s, token_s, shape)
-    schedule = StreamToAct(prior, 2.33).schedule(plans)
-    assert schedule.start_s[0, 0] == pytest.approx(float(safe_start(plans.arrival_s, nominal_s)[0]), abs=1e-4)
-    assert schedule.start_s[0, 0] == pytest.approx(0.5 + 8 * 1.5 - 7, abs=1e-4)
-    np.testing.assert_allclose(np.diff(schedule.start_s, axis=0), 1.0, atol=1e-4)
 
 
 def test_plans_without_tokens_or_shape_are_refused() -> None:

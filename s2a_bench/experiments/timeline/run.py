@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from s2a_bench.act.events import Requested, SkillArrived, StreamEnded, TokenArrived
 from s2a_bench.act.executor import SILENCE_S
 from s2a_bench.act.record import Record
@@ -27,6 +29,7 @@ from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Skill
 from s2a_bench.policy import Floats, Plans
+from s2a_bench.policy.conformal import take
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.progress import Progress, watching
 from s2a_bench.provenance import Origins, Provenance
@@ -161,9 +164,7 @@ class _RealTime:
         self.calibrations |= following.facts(case.setting)
         token_s, plans = draw(case, self.plan.learning.seed, self.plan.plans, "plans")
         for place in range(self.plan.plans):
-            cut = slice(place, place + 1)
-            one = Plans(plans.arrival_s[:, cut], plans.nominal_s[:, cut], plans.least_s[:, cut], plans.most_s[:, cut])
-            self._execute(case.setting, place, token_s[:, place], one, following)
+            self._execute(case.setting, place, token_s[:, place], take(plans, np.array([place])), following)
             self.progress.advance()
 
     def _execute(self, setting: PlanSetting, plan: int, token_s: Floats, plans: Plans, following: Following) -> None:

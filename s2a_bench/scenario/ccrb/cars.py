@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.plan.skillset import Gap
 from s2a_bench.policy import Floats, Plans, Schedule
+from s2a_bench.policy.schedule import align, safe_start, work_conserving
 
 KMH: Final = 1 / 3.6
 NCAP_SPEED_MPS: Final = 50 * KMH
@@ -51,7 +52,7 @@ class Cars:
     follower: str = "careful"
     """The trailing car's law, a name of FOLLOWERS."""
     reflex: bool = False
-    """Whether the ego also brakes independently of the plan: `ego.Reflex`."""
+    """Whether the ego also brakes independently of the plan, near contact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +118,6 @@ def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> tuple[Schedule, NDArray[np
     on up to T_max, and the roll-out is late, as the mask says: safety goes before smoothness. All arrivals are known;
     ``deadline_s`` is one number, or of shape (M,).
     """
-    from s2a_bench.policy.schedule import align, safe_start, work_conserving
-
     arrival_s, nominal_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.most_s)
     deadline = np.broadcast_to(np.asarray(deadline_s, float), arrival_s.shape[1:])
     safe, least = safe_start(arrival_s, nominal_s), safe_start(arrival_s, most_s)

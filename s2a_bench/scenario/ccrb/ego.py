@@ -46,7 +46,7 @@ class Ego(LockStep):
         self._lanes = (0, *plan.lane)
         self._gaps = gaps
         self._between = {gap: BETWEEN[gap] for gap in set(gaps.tolist())}
-        self._reflex = Reflex(rollouts) if cars.reflex else None
+        self._reflex, self._braking = cars.reflex, np.zeros(rollouts, bool)
         self.index = np.full(rollouts, -1)  # the current or last skill
         self._next_s = self._start_s[0].copy()
         self._from_s, self._until_s = np.zeros(rollouts), np.full(rollouts, -np.inf)
@@ -74,8 +74,11 @@ class Ego(LockStep):
                 wanted = rule(speed, self._slope, self._points[0])
                 wish = np.where(between & (self._gaps == gap), wanted, wish)
         wish = np.clip(wish, EGO_LEAST_MPS2, MOST_MPS2)
-        if self._reflex is not None:
-            wish = self._reflex.limit(wish, speed, gap_m, lead_mps, lead_decel)
+        if self._reflex:  # full braking near contact, until the ego is no faster than the lead
+            closing = speed - lead_mps
+            alarm = (needed(speed, gap_m, lead_mps, lead_decel) > REFLEX_MPS2) | (gap_m < closing * REFLEX_TTC_S)
+            self._braking = (self._braking | alarm) & (closing > 0)
+            wish = np.where(self._braking, EGO_LEAST_MPS2, wish)
         most = JERK_MPS3 * step_s
         self.acceleration_mps2 = self.acceleration_mps2 + np.clip(wish - self.acceleration_mps2, -most, most)
         return self.acceleration_mps2
@@ -103,16 +106,3 @@ class Ego(LockStep):
         after = np.where(self.index == len(self._start_s) - 1, DONE, GAP)
         running = np.where(now_s < self._until_s, ACTING, after)
         self.phase = np.where(self.index < 0, WAITING, running)
-
-
-class Reflex(LockStep):
-    """A layer below the plan: full braking near contact, until the ego is no faster than the lead."""
-
-    def __init__(self, rollouts: int) -> None:
-        self._braking = np.zeros(rollouts, bool)
-
-    def limit(self, wish: Floats, speed: Floats, gap_m: Floats, lead_mps: Floats, lead_decel: Floats) -> Floats:
-        closing = speed - lead_mps
-        alarm = (needed(speed, gap_m, lead_mps, lead_decel) > REFLEX_MPS2) | (gap_m < closing * REFLEX_TTC_S)
-        self._braking = (self._braking | alarm) & (closing > 0)
-        return np.where(self._braking, EGO_LEAST_MPS2, wish)

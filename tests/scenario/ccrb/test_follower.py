@@ -48,13 +48,6 @@ def test_each_law_is_the_idm_on_what_its_name_promises(
     assert law(CARS, 1).acceleration(SEEN, 10.0)[0] == pytest.approx(wanted)  # a step in which any brake builds up
 
 
-@pytest.mark.parametrize("law", [Hdm, Hybrid])
-def test_without_delay_all_are_the_idm(law: type[Idm]) -> None:
-    now = replace(SEEN, ego_then=SEEN.ego, rear_then=SEEN.rear)
-    cars = replace(CARS, reaction_s=0.0)
-    assert law(cars, 1).acceleration(now, 10.0) == pytest.approx(Idm(cars, 1).acceleration(now, 10.0))
-
-
 def test_the_brake_builds_up_in_0_6_s() -> None:
     hard = replace(SEEN, ego=motion(41.0, 0.0, 0.0))
     assert Idm(CARS, 1).acceleration(hard, 0.1)[0] == pytest.approx(-7 * 0.1 / 0.6)
