@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,7 @@ ALONE = {name: value for name, value in os.environ.items() if name not in {"PYTH
 
 
 def tracked() -> list[str]:
-    """Return what git keeps or would keep of this checkout; skip the test where this is no git checkout."""
+    """Return what git keeps or would keep of this checkout; skip the test where this is not a git checkout."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
@@ -43,7 +44,7 @@ def run(*command: str | Path, cwd: Path, **environ: str) -> str:
     done = subprocess.run(
         command, cwd=cwd, env=ALONE | environ, capture_output=True, text=True, check=False, timeout=600
     )
-    if "NewConnectionError" in done.stderr or "NameResolutionError" in done.stderr:
+    if re.search("NewConnection|NameResolution|ConnectTimeout|ReadTimeout|ProxyError", done.stderr):
         pytest.skip("no package index can be reached")
     assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
     return done.stdout
@@ -51,7 +52,7 @@ def run(*command: str | Path, cwd: Path, **environ: str) -> str:
 
 def pip(python: Path, *arguments: str | Path, cwd: Path) -> None:
     """Run this environment's pip for another Python."""
-    run(sys.executable, "-m", "pip", "--python", python, *arguments, cwd=cwd)
+    run(sys.executable, "-m", "pip", "--python", python, "--retries", "1", "--timeout", "30", *arguments, cwd=cwd)
 
 
 def pythons() -> list[str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import s2a_bench
-import s2a_bench.library  # before autodoc does so with TYPE_CHECKING set, which pydantic does not bear
+import s2a_bench.library  # pydantic fails if autodoc imports it first, with TYPE_CHECKING set
 
 ROOT = Path(__file__).resolve().parents[2]
 ANCHOR = re.compile(r"^<a id=\"([^\"]+)\"></a>$", re.MULTILINE)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import webbrowser
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -30,7 +28,6 @@ QUESTIONS: Final = {
     "latency": "What transports cost, measured here without a model:",
     "timeline": "When the robot may act, EMULATED after the paper's boards (computed, so there is no interval):",
 }
-ANSWER: Final = re.compile("times as long as|no difference|stall")
 NEXT: Final = (
     "s2a-bench latency --url http://127.0.0.1:8000    # a server that runs already",
     "s2a-bench timeline --rate 10 --jitter lognormal:cv=0.2    # the tokens/s of your model",
@@ -43,22 +40,36 @@ class DemoConfig(Options):
 
 
 def _demo(config: DemoConfig) -> None:
+    from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.library import run
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
 
     page = config.output / "demo.html"
     to_page = ReportConfig(runs=[], output=page)  # raises UsageError before anything is measured
-    chapters = read_chapters(_run(config.output))
-    for place, chapter in enumerate(chapters):
-        figures = {name: draw for name, draw in chapter.content.figures.items() if name in FIGURES}
-        chapters[place] = replace(chapter, content=replace(chapter.content, figures=figures))
-    write_report(make_report(chapters), to_page)
+    folders: list[Path] = []
+    progress = RunProgress()
+    try:
+        for name, options in RUNS.items():
+            with RunProgress() as progress:
+                folders.append(run(name, output=config.output, progress=progress, **options).path)
+        chapters = read_chapters(folders)
+        for place, chapter in enumerate(chapters):
+            figures = {name: draw for name, draw in chapter.content.figures.items() if name in FIGURES}
+            chapters[place] = replace(chapter, content=replace(chapter.content, figures=figures))
+        write_report(make_report(chapters), to_page)
+    except (S2AError, KeyboardInterrupt):
+        paths = dict.fromkeys((*folders, progress.folder))
+        if kept := [str(folder) for folder in paths if folder and folder.exists()]:
+            progress.say(f"what was measured so far: {shlex.join(['s2a-bench', 'report', *kept])}")
+        raise
     for chapter in chapters:
         for warning in chapter.run.manifest["warnings"]:
             print_error(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
-        for line in read_off(str(chapter.run.manifest["command"]), chapter.content.sentences):
-            print_line(line)
-    for line in (f"The page has both: {page}", "To go on:", *(f"  {line}" for line in NEXT)):
+        print_line(QUESTIONS[str(chapter.run.manifest["command"])])
+        for sentence in chapter.content.sentences:
+            print_line(f"  {sentence}")
+    for line in (f"Page: {page}", "Next:", *(f"  {line}" for line in NEXT)):
         print_line(line)
     if not config.no_open and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.resolve().as_uri())
@@ -66,25 +77,3 @@ def _demo(config: DemoConfig) -> None:
 
 
 demo = command(_demo, DemoConfig)
-
-
-def read_off(name: str, sentences: Sequence[str]) -> list[str]:
-    """Return an experiment's question, and those of its run's sentences that answer it."""
-    return [QUESTIONS[name], *(f"  {sentence}" for sentence in sentences if ANSWER.search(sentence))]
-
-
-def _run(output: Path) -> list[Path]:
-    from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.library import run
-
-    folders: list[Path] = []
-    for name, options in RUNS.items():
-        with RunProgress() as progress:
-            try:
-                folders.append(run(name, output=output, progress=progress, **options).path)
-            except (S2AError, KeyboardInterrupt):
-                kept = [str(folder) for folder in (*folders, progress.folder) if folder and folder.exists()]
-                if kept:
-                    progress.say(f"what was measured so far: {shlex.join(['s2a-bench', 'report', *kept])}")
-                raise
-    return folders

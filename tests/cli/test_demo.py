@@ -9,6 +9,7 @@ import pytest
 
 from s2a_bench import library
 from s2a_bench.cli import demo
+from s2a_bench.report.page import files
 from s2a_bench.store.run import read_run
 from tests.cli.program import called, program, refused
 
@@ -42,10 +43,10 @@ def test_two_runs_become_one_page_with_a_figure_of_each(tmp_path: Path, opened: 
     assert "Execution timelines: N = 8 skills" in page
     assert "Distribution: end to end" not in page
     assert kept(tmp_path) == {"latency": "finished", "timeline": "finished"}
-    assert "  naive stalls in the one setting, most on Jetson AGX Orin with L = 6: 1.75 s a plan;" in done.stdout
+    assert "  naive stalls in the only setting, on Jetson AGX Orin with L = 6: 1.75 s a plan;" in done.stdout
     assert done.stdout.splitlines()[-4:] == [
-        f"The page has both: {tmp_path / 'demo.html'}",
-        "To go on:",
+        f"Page: {tmp_path / 'demo.html'}",
+        "Next:",
         *(f"  {line}" for line in demo.NEXT),
     ]
     assert opened == []
@@ -78,19 +79,24 @@ def test_ctrl_c_keeps_what_was_measured_and_says_how_to_see_it(
     assert opened == []
 
 
+def test_ctrl_c_while_the_page_is_drawn_names_both_runs(
+    tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "write_report", interrupted)
+    done = called("demo", "--output", tmp_path, code=130)
+    first, second = sorted(tmp_path.iterdir())
+    assert f"what was measured so far: s2a-bench report {first} {second}\n" in done.stderr
+    assert opened == []
+
+
 def test_a_page_that_no_report_wrote_is_refused_before_anything_is_measured(tmp_path: Path, opened: list[str]) -> None:
     (tmp_path / "demo.html").write_text("mine")
     assert "s2a-bench report did not write it" in refused("demo", "--output", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["demo.html"]
     assert opened == []
-
-
-def test_the_sentences_that_answer_a_question_are_read_off() -> None:
-    ratio, policy = "http/binary takes 2 times as long as ros/topic.", "naive stalls in 2 of 3 settings."
-    question, *answers = demo.read_off("latency", ["60 requests a cell.", ratio])
-    assert question.endswith(":")
-    assert answers == [f"  {ratio}"]
-    assert demo.read_off("timeline", ["3 settings of board and granularity.", policy])[1:] == [f"  {policy}"]
 
 
 @pytest.mark.slow

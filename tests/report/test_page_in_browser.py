@@ -148,7 +148,9 @@ def test_every_figure_is_drawn_and_every_reference_is_the_pages_own(opened: Call
     chapters = found(browser, "section[id^=run-]")
     assert len(chapters) == 6
     assert all(found(chapter, ".plot") for chapter in chapters)
-    assert all(min(svg.size.values()) > 100 for svg in found(browser, ".plot svg") if svg.is_displayed())
+    for plot in found(browser, ".plot"):
+        (svg,) = (each for each in found(plot, "svg") if each.is_displayed())
+        assert min(svg.size.values()) > 100
     assert all(width > 0 for width in browser.execute_script(WIDTHS_OF_IMAGES))
     ids = browser.execute_script("return [...document.querySelectorAll('[id]')].map((part) => part.id)")
     assert len(ids) == len(set(ids))

@@ -91,7 +91,7 @@ def as_line(every: Sequence[Difference]) -> str:
 def _differing(
     prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fatal: bool
 ) -> Iterator[Difference]:
-    """Yield the facts that differ; an empty and an absent one are equal, a withheld one is like any."""
+    """Yield the facts that differ; an empty and an absent one are equal, a withheld fact matches any value."""
     for name in dict.fromkeys((*first, *second)):
         one, two = first.get(name), second.get(name)
         if one == two or not (one or two):

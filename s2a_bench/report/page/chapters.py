@@ -67,19 +67,24 @@ def run_folders(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     folders: list[Path] = []
     lines: list[str] = []
     for path in paths:
-        if (path / MANIFEST).exists() or not path.exists():
-            folders.append(path)
-            continue
+        try:
+            if (path / MANIFEST).exists() or not path.exists():
+                folders.append(path)
+                continue
+            entries = sorted(path.iterdir()) if path.is_dir() else []
+        except OSError as error:
+            raise StoreError(f"cannot read {path}: {error.strerror}") from error
         held = []
-        for entry in sorted(path.iterdir()) if path.is_dir() else ():
+        for entry in entries:
             try:
                 held.append((str(read_run(entry).manifest.get("started")), entry))
             except StoreError as error:
-                lines.append(f"skipped: {str(error).partition(': ')[0]}")
+                what, _, why = str(error).partition(": ")
+                lines.append(f"skipped: {what}" + ("" if what.endswith("is not a run folder") else f": {why}"))
         if not held:
             lines.append(f"skipped: {path} is not a run folder, and holds none")
         if len(held) > MOST_RUNS:
-            lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are shown; name folders of others")
+            lines.append(f"{path} holds {len(held)} runs: the latest {MOST_RUNS} are used; name the folders of others")
         folders += [entry for _, entry in sorted(held)[-MOST_RUNS:]]
     if not folders:
         holder = next((f", as {each.parents[1]}" for path in paths for each in path.glob(f"*/*/{MANIFEST}")), "")
@@ -130,7 +135,7 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
         if what := "; ".join(str(each) for each in every if is_other_machine(each)):
             unlike.setdefault(what, []).append(chapter.title)
     lines = [
-        f"{', '.join(titles[:1])}{f' and {len(titles) - 1} more' if len(titles) > 1 else ''} ran on another machine "
+        f"{titles[0]}{f' and {len(titles) - 1} more' if len(titles) > 1 else ''} ran on another machine "
         f"than {chapters[0].title} ({what}): their numbers are side by side, and none combines both."
         for what, titles in unlike.items()
     ]

@@ -43,23 +43,24 @@ class DrawnFigure:
     pdf: bytes | None
 
 
-def draw(chapter: Chapter, *, pdf: bool) -> dict[str, DrawnFigure]:
-    """Build each figure, the first in two widths; its SVG has no line of provenance, as the page labels it."""
+def draw(chapter: Chapter, *, page: bool = True, pdf: bool = False) -> dict[str, DrawnFigure]:
+    """Build each figure, for a page as SVG without its line of provenance, the first in two widths."""
     import matplotlib as mpl
 
     drawn = {}
     for place, (name, build) in enumerate(chapter.content.figures.items()):
         svgs: list[str] = []
         with chapter.content.noted(f"figure {name}"):
-            for width_in in (WIDTH_IN,) if place else (PAGE_IN, WIDTH_IN):
+            for width_in in (PAGE_IN, WIDTH_IN) if page and not place else (WIDTH_IN,):
                 prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', chapter.name)}-{place}-{len(svgs)}-"
                 style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
                 with paper_column(width_in), mpl.rc_context(style):
                     figure = build()
                     as_pdf = _saved(figure, "pdf", "CreationDate") if pdf and width_in == WIDTH_IN else None
-                    figure.suptitle("").set_in_layout(False)
-                    svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
-                svgs.append(inline(svg[svg.index("<svg") :], prefix))
+                    if page:
+                        figure.suptitle("").set_in_layout(False)
+                        svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
+                        svgs.append(inline(svg[svg.index("<svg") :], prefix))
             title, *notes = caption_of(figure)
             drawn[name] = DrawnFigure(svgs, title, notes, figure.get_figwidth() > WIDTH_IN, as_pdf)
     return drawn
@@ -86,6 +87,8 @@ def inline(svg: str, prefix: str) -> str:
 _MARK = f"<!-- {GENERATOR} -->"
 _LONG_ROWS = 30
 """A longer table needs more than one page."""
+_OPEN_ROWS = 40
+"""A longer table is folded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +115,7 @@ def make_report(chapters: Sequence[Chapter], *, against: str = "") -> Report:
 def write_report(report: Report, config: ReportConfig) -> list[Path]:
     """Write the outputs and return their files; raises StoreError."""
     drawn = {
-        chapter.name: draw(chapter, pdf=config.latex is not None)
+        chapter.name: draw(chapter, page=config.page is not None, pdf=config.latex is not None)
         for chapter in report.chapters
         if config.page or config.latex
     }
@@ -197,6 +200,7 @@ def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
     )
     world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
     world.tests["long"] = lambda text: len(text) > 80  # noqa: PLR2004 - two lines on a phone
+    world.tests["longer"] = lambda rows: len(rows) > _OPEN_ROWS
     world.filters["short"] = lambda value: f"{value:.6g}"
     return world.get_template("page.html").render(
         generator=GENERATOR,
@@ -224,4 +228,5 @@ def _view(chapter: Chapter, figures: Sequence[DrawnFigure]) -> dict[str, Any]:
         "about": [note for note in dict.fromkeys(chain(*noted)) if sum(note in notes for notes in noted) > 1],
         "figures": figures,
         "opened": opened,
+        "facts": {name: fact["about"] for name, fact in chapter.run.facts.items()},
     }

@@ -30,8 +30,6 @@ from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
 
-_MOST_SENTENCES = 4
-
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     cells = cells_of(run)
@@ -55,7 +53,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def _latency_sentences(cells: RequestCells) -> list[str]:
-    """Return how many times as long cells take as another, in process if there is no other: a sentence for each."""
+    """Return how many times as long cells take as another, in process if there is no other; else their medians."""
     metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
     by_base: dict[tuple[bool, str, str], list[tuple[RequestCell, RequestCell, Ratio]]] = {}
     for of, cell, base, ratio in cells.ratios:
@@ -67,7 +65,10 @@ def _latency_sentences(cells: RequestCells) -> list[str]:
         f"{of.replace('_', ' ').removeprefix('e2e ').capitalize()}, {_difference(pairs)}"
         for (_, of, _), pairs in wired.items()
     ]
-    return [*sentences[:_MOST_SENTENCES], *launches_note(ratio for pairs in wired.values() for *_, ratio in pairs)]
+    if not sentences:
+        medians = (f"{cell.label}{_of(cell.payload)} {entries(cell.values(metric), 'median')[0]}" for cell in cells)
+        sentences = [f"{metric_phrase(metric)}, medians in ms: {', '.join(medians)}."] if cells else []
+    return [*sentences, *launches_note(ratio for pairs in wired.values() for *_, ratio in pairs)]
 
 
 def _difference(pairs: Sequence[tuple[RequestCell, RequestCell, Ratio]]) -> str:

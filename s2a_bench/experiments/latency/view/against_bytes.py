@@ -241,7 +241,9 @@ def _sentences(pipelines: Sequence[FittedPipeline]) -> Iterator[str]:
             text = f"{_estimate(each.line.slope)} ms over {each.name}"
             slopes.setdefault(each.payload, []).append((each.line.slope.value, text))
     for payload, costs in slopes.items():
-        yield f"With {payload} pictures a megabyte of pixels takes {min(costs)[1]} to {max(costs)[1]}."
+        with_payload = f"With {payload} pictures a" if payload else "A"
+        most = f" to {max(costs)[1]}" if len(costs) > 1 else ""
+        yield f"{with_payload} megabyte of pixels takes {min(costs)[1]}{most}."
 
 
 def shown(runs: Sequence[RequestCells]) -> tuple[list[str], Tables, dict[str, Callable[[], Figure]]]:

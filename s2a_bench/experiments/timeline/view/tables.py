@@ -62,9 +62,9 @@ def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     if plans > 1:
         high = upper_bound(int(worst.values("p_any_stall").sum()), plans, 0.975)
         of_plans = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
-    where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
-    most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {worst.stall_s:.2f} s a plan"
-    return f"{policy} stalls in {where}, {most};{of_plans} {late}."
+    where = f"{len(stalling)} of {len(cells)} settings, most" if len(cells) > 1 else "the only setting,"
+    most = f"on {worst.first.title} with L = {worst.first.tokens_per_skill}: {worst.stall_s:.2f} s a plan"
+    return f"{policy} stalls in {where} {most};{of_plans} {late}."
 
 
 _EXECUTION = ("start_s", "end_s", "stalls", "stall_s", "longest_stall_s", "start_regret", "end_regret")
