@@ -12,12 +12,12 @@ from typing import Any, Final
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import STAND_IN
 from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.resources import POWER_W
+from s2a_bench.plugins.chunks.acting import plan_of
 from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured, RobotLoad, SearchPlan
 from s2a_bench.plugins.chunks.capacity.generator import STRIDE, Fleet, FleetOnRay, FleetPlan, FleetProcess
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
@@ -54,14 +54,12 @@ LATEST: Final = 0.05
 
 def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder, which keeps what was measured if S2AError is raised."""
-    plan = resolve(config.robots_requests, progress.say)
-    settings = {**plan.manifest["configuration"], **config.to_manifest()}
     cadence = {
         "chunks": f"control loops at {config.control_hz:g} Hz",
         "plans": f"a plan every {config.plan_ns / 1e9:g} s",
         "closed": f"closed loop, {config.think_s:g} s from an answer to the next request",
     }
-    plan = plan.with_manifest(configuration=settings, cadence=cadence[config.load])
+    plan = plan_of(config, cadence[config.load], progress)
     if config.load != "closed":  # an instant server would get requests without a pause
         plan = plan.with_cells([twin(cell) for cell in plan.cells])
     with ExitStack() as stack:
