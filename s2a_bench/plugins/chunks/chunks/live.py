@@ -24,7 +24,7 @@ from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, sta
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes
 from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksLive
 from s2a_bench.plugins.chunks.control import Acted
-from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
+from s2a_bench.plugins.chunks.latencies import Source, measured, write_delays
 from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester
@@ -105,8 +105,7 @@ def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
         mode = next(iter(config.control.modes.values()))
-        rows = delay_rows(next(measured(folder)), np.empty(0, np.int64), mode, config.setting)
-        write_delays(config.export_delays, rows)
+        write_delays(config.export_delays, next(measured(folder)), np.empty(0, np.int64), mode, config.setting)
     return folder
 
 
