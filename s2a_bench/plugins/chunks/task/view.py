@@ -117,11 +117,7 @@ def motion_table(cells: Sequence[TaskCell]) -> TextTable:
 
 
 def _table(
-    title: str,
-    header: Sequence[str],
-    cells: Sequence[TaskCell],
-    entries: Iterable[Iterable[str]],
-    notes: Sequence[str],
+    title: str, header: Sequence[str], cells: Sequence[TaskCell], entries: Iterable[Iterable[str]], notes: Sequence[str]
 ) -> TextTable:
     rows = [(cell.mode, cell.source, *texts) for cell, texts in zip(cells, entries, strict=True)]
     groups = (group for _, group in groupby(rows, lambda row: row[0]))

@@ -13,13 +13,7 @@ from scipy import stats
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Rounding, mode
 from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
 from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
-from s2a_bench.plugins.chunks.modes.closed import (
-    Closed,
-    appended,
-    replace_stall_share,
-    slow_down,
-    stall_share,
-)
+from s2a_bench.plugins.chunks.modes.closed import Closed, appended, replace_stall_share, slow_down, stall_share
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from s2a_bench.policy.schedule import safe_start
 from tests.conftest import examples
@@ -129,12 +123,7 @@ def test_the_start_of_a_streamed_chunk_is_the_safe_start_of_its_plan(
     assert start_s[0] == pytest.approx((first + (horizon - 1) * max(0, gap - period)) / 1e9, abs=1e-9)
 
 
-@given(
-    latency=st.integers(0, 200),
-    gap=st.integers(0, 60),
-    rounding=ROUNDINGS,
-    s=st.integers(1, 9),
-)
+@given(latency=st.integers(0, 200), gap=st.integers(0, 60), rounding=ROUNDINGS, s=st.integers(1, 9))
 def test_a_safe_start_is_never_early_and_at_most_a_tick_late(
     latency: int, gap: int, rounding: Rounding, s: int
 ) -> None:
@@ -164,13 +153,7 @@ def within(stalls: int, count: int, probability: float) -> bool:
 
 
 MS = 1_000_000
-RANDOM = [
-    (Queue(4, 8), 4),
-    (Queue(5, 16), 5),
-    (Aggregate(3), 3),
-    (Aggregate(7), 7),
-    (Replace(12, "one"), 4),
-]
+RANDOM = [(Queue(4, 8), 4), (Queue(5, 16), 5), (Aggregate(3), 3), (Aggregate(7), 7), (Replace(12, "one"), 4)]
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
