@@ -34,18 +34,9 @@ def constant(latency: int, requests: int = 8) -> Any:
 def cases_at_a_constant_latency(draw: st.DrawFn) -> tuple[Mode, int, ControlSetting]:
     horizon = draw(st.integers(1, 14))
     execute, trigger = draw(st.integers(1, horizon)), draw(st.integers(0, 12))
-    made = draw(
-        st.sampled_from(
-            [
-                Sync(execute),
-                Queue(trigger, execute),
-                Streamed(trigger, execute, draw(st.integers(0, 50)) * 1e-9),
-                Replace(execute),
-                Replace(execute, "many"),
-                Aggregate(trigger),
-            ]
-        )
-    )
+    streamed = Streamed(trigger, execute, draw(st.integers(0, 50)) * 1e-9)
+    replaces = (Replace(execute), Replace(execute, "many"))
+    made = draw(st.sampled_from([Sync(execute), Queue(trigger, execute), streamed, *replaces, Aggregate(trigger)]))
     return made, draw(st.integers(0, 400)), ControlSetting(PERIOD, horizon, draw(ROUNDINGS))
 
 
