@@ -134,7 +134,6 @@ class _Cell:
             self._conclude()
 
     def _predict(self) -> None:
-        """Write the prediction of the fleets from one robot's service times."""
         if self.service is None:
             return
         name, progress = self.load.of(self.session.cell.name), self.launch.progress

@@ -258,6 +258,8 @@ def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
 def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case
     agree((mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)), step(mode, latency_ns, setting))
+    without_arrays = Varied(mode.mode, mode.triggers)
+    agree((without_arrays.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))
 
 
 @given(case=varied())
