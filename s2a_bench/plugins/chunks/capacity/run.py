@@ -180,11 +180,10 @@ class _Cell:
     def _write(self, about: AboutRobot, trace: RobotTrace) -> None:
         settle_ns, writer = self.load.settle_ns, self.launch.writer
         writer.append(ROBOTS, [RobotRow(**vars(about), **vars(measures([trace], self.load.setting, settle_ns)))])
-        since_ns = (trace.request_ns - trace.start_ns).tolist()
-        latency_ns = [each if each >= 0 else None for each in trace.arrival_ns.tolist()]
-        times = zip(since_ns, latency_ns, strict=True)
+        times = zip((trace.request_ns - trace.start_ns).tolist(), trace.arrival_ns.tolist(), strict=True)
         rows = (
-            RequestRow(**vars(about), intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in times
+            RequestRow(**vars(about), intended_ns=at, latency_ns=None if taken < 0 else taken, settling=at < settle_ns)
+            for at, taken in times
         )
         writer.append(REQUESTS, rows)
 
