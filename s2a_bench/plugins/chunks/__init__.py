@@ -4,3 +4,6 @@
 ``latencies`` has the delays that both experiments draw from, ``requester`` asks a server for chunks. docs/chunks.md,
 docs/capacity.md.
 """
+
+LIVE = {"live": "act in real time on what a server answers; with --engine echo, --latency is how long that takes"}
+"""The option that chooses the run mode ``live``, and its help."""

@@ -11,19 +11,33 @@ import numpy as np
 from s2a_bench.act import ActionRobot, TaskRobot
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.harness.plan import RunPlan, resolve
 from s2a_bench.harness.rounds import RunningLaunch
 from s2a_bench.harness.session import Session
 from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Ints, Mode, mode
+from s2a_bench.plugins.chunks.options import ControlPlan, ServedOptions
 from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
+from s2a_bench.progress import Progress
 from s2a_bench.types import Frame, Pixels, Vector
 
 CLIENTS: Final = 4
-"""The clients of a cell, for acting modes with several concurrent requests."""
 KEEP_S: Final = 0.05
 """Period in which measurements are written while the loop runs."""
 WARM_UP_TICK_NS: Final = 20_000_000
 """The longest tick of the loop that warms up."""
+
+
+def plan_of(config: ServedOptions, cadence: str, progress: Progress) -> RunPlan:
+    """Return the run plan of the robots' requests; its manifest has all options."""
+    plan = resolve(config.robots_requests, progress.say)
+    settings = {**plan.manifest["configuration"], **config.to_manifest()}
+    return plan.with_manifest(configuration=settings, cadence=cadence)
+
+
+def clients_of(control: ControlPlan) -> int:
+    """Return the clients of a cell, several for acting modes with several concurrent requests."""
+    return CLIENTS if any(each.several for each in control.modes.values()) else 1
 
 
 def warm_up(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -191,15 +191,25 @@ COLUMNS: Final = (
 """Columns of the exported delays, a row a request, which docs/chunks.md explains; `boards.latency` reads the file."""
 
 
-def delay_rows(source: Source, drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
-    """Yield a row a request: all measured requests at their times, or those of ``mode`` with drawn latencies."""
+def write_delays(path: Path, source: Source, drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> None:
+    """Write the requests of a source as CSV, or those of ``mode`` with drawn latencies; raises StoreError."""
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(_delays(source, drawn_ns, mode, setting))
+    except OSError as error:
+        raise StoreError(f"`export_delays`: cannot write {path}: {error}") from error
+
+
+def _delays(source: Source, drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
     requests = source.requests or list(_simulated(drawn_ns, mode, setting))
     delays = setting.delay_ticks(np.array([request["latency_ns"] for request in requests], np.int64))
     for number, (request, delay) in enumerate(zip(requests, delays.tolist(), strict=True)):
         yield {
             "request": number,
             "provenance": source.provenance.code,
-            **{name: "" if value is None else value for name, value in request.items()},
+            **request,
             "d": delay,
             "rounding": setting.rounding,
             "delta_t_ns": setting.period_ns,
@@ -210,14 +220,3 @@ def _simulated(drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[
     request_ns = mode.cycles(drawn_ns, setting).request_tick * setting.period_ns
     for at_ns, latency_ns in zip(request_ns.tolist(), drawn_ns.tolist(), strict=True):
         yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
-
-
-def write_delays(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
-    """Write rows as CSV; raises StoreError."""
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise StoreError(f"`export_delays`: cannot write {path}: {error}") from error

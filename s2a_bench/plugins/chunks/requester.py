@@ -9,6 +9,7 @@ from itertools import count
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
+from types import SimpleNamespace
 from typing import Any, Final, TypeAlias
 
 from s2a_bench.errors import RequestFailed, UsageError
@@ -34,16 +35,6 @@ class Job:
     state: tuple[float, ...]
     picture: Frame | None = None
     """The robot's; None: a camera's."""
-
-
-@dataclass(frozen=True, slots=True)
-class Still:
-    """A camera that delivers one picture."""
-
-    picture: Frame
-
-    def read(self) -> Frame:
-        return self.picture
 
 
 @dataclass(slots=True)
@@ -142,7 +133,7 @@ class ChunkRequester:
 
 def show(session: Session, picture: Frame) -> None:
     """Let the session's next requests carry a robot's picture."""
-    still: Any = Still(picture)  # of a source, `read` is all that a feed needs
+    still: Any = SimpleNamespace(read=lambda: picture)  # of a source, `read` is all that a feed needs
     if isinstance(session.feed, RequestFeed):
         session.feed = replace(session.feed, source=still)
         session.request = replace(session.request, size=f"{picture.width}x{picture.height}")

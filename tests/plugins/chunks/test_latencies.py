@@ -15,6 +15,7 @@ from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import REQUESTS
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.latencies import COLUMNS, Source, sources, split, write_delays
+from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from tests.made_runs import MakeRun
@@ -120,4 +121,4 @@ def test_a_place_that_is_none_is_refused_before_anything_is_computed(tmp_path: P
             ChunksVirtual(export_delays=file)
     (tmp_path / "d.csv").mkdir()
     with pytest.raises(StoreError, match="`export_delays`: cannot write"):
-        write_delays(tmp_path / "d.csv", [])
+        write_delays(tmp_path / "d.csv", one("40"), np.empty(0, np.int64), mode("sync"), ControlSetting(20 * MS, 16))

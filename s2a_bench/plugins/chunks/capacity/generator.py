@@ -378,8 +378,7 @@ class FleetOnRay(RemoteFleet):
         reply = self._fleet.machine.remote()
         if not self._ray.wait([reply], timeout=FREE_CORE_S)[0]:
             raise UsageError(f"`processes`: no core of the cluster came free within {FREE_CORE_S:g} s; take fewer")
-        facts: dict[str, Any] = self._result(reply)
-        return facts
+        return dict(self._result(reply))
 
     def close(self) -> None:
         self._ray.wait([self._fleet.close.remote()], timeout=2 * PATIENCE_S)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Final
 
@@ -154,26 +154,39 @@ def _stalls(
     traces: Sequence[RobotTrace], setting: ControlSetting, settle_ns: int, confidence: float
 ) -> dict[str, float]:
     """Return the stalled share, its interval and that of the worst robot, of ticks or of plans; empty without any."""
-    robots, at_ns, stalled = [], [], []
-    for trace in traces:
+
+    def stalls_of(trace: RobotTrace) -> tuple[Ints, Flags] | None:
         if trace.plan_stalled is not None:
-            since_ns, stops = trace.request_ns - trace.start_ns, trace.plan_stalled
-        elif trace.ticks is not None:
-            stops = trace.ticks.chunk < 0
-            since_ns = np.arange(stops.size) * setting.period_ns
-        else:
-            continue
-        stops, since_ns = stops[since_ns >= settle_ns], since_ns[since_ns >= settle_ns]
-        robots.append(np.full(stops.size, trace.robot))
-        at_ns.append(trace.start_ns + since_ns)
-        stalled.append(stops)
-    of_robot, times, stops = _joined(robots), _joined(at_ns), _joined(stalled)
-    if not stops.size:
+            return trace.request_ns - trace.start_ns, trace.plan_stalled
+        if trace.ticks is None:
+            return None
+        return np.arange(trace.ticks.chunk.size) * setting.period_ns, trace.ticks.chunk < 0
+
+    at_ns, robots, stalled = flagged(traces, settle_ns, stalls_of)
+    if not stalled.size:
         return {}
-    low, high = share_interval(stops, times, of_robot, cycle_ns(traces), confidence)
-    due = np.bincount(of_robot)
-    worst = (np.bincount(of_robot, stops)[due > 0] / due[due > 0]).max()
-    return {"stalled": float(stops.mean()), "stalled_low": low, "stalled_high": high, "stalled_worst": float(worst)}
+    low, high = share_interval(stalled, at_ns, robots, cycle_ns(traces), confidence)
+    due = np.bincount(robots)
+    worst = (np.bincount(robots, stalled)[due > 0] / due[due > 0]).max()
+    return {"stalled": float(stalled.mean()), "stalled_low": low, "stalled_high": high, "stalled_worst": float(worst)}
+
+
+def flagged(
+    traces: Sequence[RobotTrace], settle_ns: int, flags_of: Callable[[RobotTrace], tuple[Ints, Flags] | None]
+) -> tuple[Ints, Ints, Flags]:
+    """Return time, robot and flag of the settled values of all traces, shapes (K,).
+
+    ``flags_of`` returns those of a trace: times after its start, and flags; None without any.
+    """
+    parts = []
+    for trace in traces:
+        if (values := flags_of(trace)) is not None:
+            since_ns, flags = values
+            settled = since_ns >= settle_ns
+            robots = np.full(np.count_nonzero(settled), trace.robot)
+            parts.append((trace.start_ns + since_ns[settled], robots, flags[settled]))
+    at_ns, of_robot, every = map(_joined, zip(*parts, strict=True) if parts else ((), (), ()))
+    return at_ns, of_robot, every
 
 
 def cycle_ns(traces: Sequence[RobotTrace]) -> float:

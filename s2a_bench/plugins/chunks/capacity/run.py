@@ -12,12 +12,12 @@ from typing import Any, Final
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import STAND_IN
 from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.resources import POWER_W
+from s2a_bench.plugins.chunks.acting import plan_of
 from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured, RobotLoad, SearchPlan
 from s2a_bench.plugins.chunks.capacity.generator import STRIDE, Fleet, FleetOnRay, FleetPlan, FleetProcess
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
@@ -54,14 +54,12 @@ LATEST: Final = 0.05
 
 def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder, which keeps what was measured if S2AError is raised."""
-    plan = resolve(config.robots_requests, progress.say)
-    settings = {**plan.manifest["configuration"], **config.to_manifest()}
     cadence = {
         "chunks": f"control loops at {config.control_hz:g} Hz",
         "plans": f"a plan every {config.plan_ns / 1e9:g} s",
         "closed": f"closed loop, {config.think_s:g} s from an answer to the next request",
     }
-    plan = plan.with_manifest(configuration=settings, cadence=cadence[config.load])
+    plan = plan_of(config, cadence[config.load], progress)
     if config.load != "closed":  # an instant server would get requests without a pause
         plan = plan.with_cells([twin(cell) for cell in plan.cells])
     with ExitStack() as stack:
@@ -136,7 +134,6 @@ class _Cell:
             self._conclude()
 
     def _predict(self) -> None:
-        """Write the prediction of the fleets from one robot's service times."""
         if self.service is None:
             return
         name, progress = self.load.of(self.session.cell.name), self.launch.progress
@@ -183,11 +180,10 @@ class _Cell:
     def _write(self, about: AboutRobot, trace: RobotTrace) -> None:
         settle_ns, writer = self.load.settle_ns, self.launch.writer
         writer.append(ROBOTS, [RobotRow(**vars(about), **vars(measures([trace], self.load.setting, settle_ns)))])
-        since_ns = (trace.request_ns - trace.start_ns).tolist()
-        latency_ns = [each if each >= 0 else None for each in trace.arrival_ns.tolist()]
-        times = zip(since_ns, latency_ns, strict=True)
+        times = zip((trace.request_ns - trace.start_ns).tolist(), trace.arrival_ns.tolist(), strict=True)
         rows = (
-            RequestRow(**vars(about), intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in times
+            RequestRow(**vars(about), intended_ns=at, latency_ns=None if taken < 0 else taken, settling=at < settle_ns)
+            for at, taken in times
         )
         writer.append(REQUESTS, rows)
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from s2a_bench.plugins.chunks.capacity.config import Limit
-from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics, RobotTrace, cycle_ns, share_interval
+from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics, RobotTrace, cycle_ns, flagged, share_interval
 from s2a_bench.plugins.chunks.capacity.rows import Verdict
-from s2a_bench.plugins.chunks.modes import Ints
+from s2a_bench.plugins.chunks.modes import Flags, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,32 +120,25 @@ class Judge:
         return "above" if low > limit.share else "undecided", within
 
 
-def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> tuple[Ints, Ints, Any]:
+def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> tuple[Ints, Ints, Flags]:
     """Return time, robot and whether above the limit, of the values of a limit on latencies or ages: shapes (K,).
 
     A request without an answer counts once it waits for longer than the limit.
     """
-    parts = []
-    for trace in traces:
-        if limit.column.startswith("age"):
-            if trace.ticks is None:
-                continue
-            age = trace.ticks.age
-            period_ns = (trace.end_ns - trace.start_ns) / max(1, age.size)
-            since_ns = (np.arange(age.size) * period_ns).astype(np.int64)
-            counts, exceeds = age >= 0, age * period_ns > limit.value
-        else:
-            taken_ns = trace.first_ns if limit.column.startswith("ttft") else trace.arrival_ns
-            if taken_ns is None:
-                continue
-            since_ns, waits_ns = trace.request_ns - trace.start_ns, trace.end_ns - trace.request_ns
-            exceeds = np.where(taken_ns < 0, waits_ns, taken_ns) > limit.value
-            counts = (taken_ns >= 0) | exceeds
-        kept = counts & (since_ns >= settle_ns)
-        robots = np.full(int(kept.sum()), trace.robot)
-        parts.append((trace.start_ns + since_ns[kept], robots, exceeds[kept]))
-    if not parts:
-        none = np.empty(0, np.int64)
-        return none, none, np.empty(0, bool)
-    at_ns, of, above = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return at_ns, of, above
+
+    def ages_above(trace: RobotTrace) -> tuple[Ints, Flags] | None:
+        if trace.ticks is None:
+            return None
+        period_ns = (trace.end_ns - trace.start_ns) / max(1, trace.ticks.age.size)
+        acted = np.flatnonzero(trace.ticks.age >= 0)
+        return (acted * period_ns).astype(np.int64), trace.ticks.age[acted] * period_ns > limit.value
+
+    def latencies_above(trace: RobotTrace) -> tuple[Ints, Flags] | None:
+        taken_ns = trace.first_ns if limit.column.startswith("ttft") else trace.arrival_ns
+        if taken_ns is None:
+            return None
+        exceeds = np.where(taken_ns < 0, trace.end_ns - trace.request_ns, taken_ns) > limit.value
+        counts = (taken_ns >= 0) | exceeds
+        return (trace.request_ns - trace.start_ns)[counts], exceeds[counts]
+
+    return flagged(traces, settle_ns, ages_above if limit.column.startswith("age") else latencies_above)

@@ -1,9 +1,9 @@
 """When to act on actions in chunks: modes and triggers under given latencies, in virtual time, or live."""
 
 from s2a_bench.experiments import Experiment, RunMode
+from s2a_bench.plugins.chunks import LIVE
 
 HERE = "s2a_bench.plugins.chunks.chunks"
-LIVE = {"live": "act in real time on what a server answers; with --engine echo, --latency is how long that takes"}
 EXPERIMENT = Experiment(
     name="chunks",
     about="Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture.",

@@ -164,17 +164,9 @@ def _tick_rows(acted: ActedCell, shown: int) -> Iterator[TickRow]:
     ticks = acted.ticks
     late = [None] * ticks.chunk.size if acted.late_ns is None else acted.late_ns.tolist()
     columns = (each[:shown].tolist() for each in (ticks.chunk, ticks.index, ticks.age, ticks.stalled))
-    for tick, (chunk, index, age, stalled, late_ns) in enumerate(zip(*columns, late[:shown], strict=True)):
-        acts = chunk >= 0
-        yield TickRow(
-            cell=acted.cell.cell,
-            tick=tick,
-            chunk=chunk if acts else None,
-            index=index if acts else None,
-            age_ticks=age if acts else None,
-            stalled=stalled,
-            late_ns=late_ns,
-        )
+    for tick, (*action, stalled, late_ns) in enumerate(zip(*columns, late[:shown], strict=True)):
+        chunk, index, age = action if action[0] >= 0 else (None, None, None)
+        yield TickRow(acted.cell.cell, tick, chunk, index, age, stalled, late_ns)
 
 
 def _request_rows(acted: ActedCell, shown: int) -> Iterator[RequestRow]:

@@ -16,16 +16,15 @@ from typing import Any
 import numpy as np
 
 from s2a_bench.errors import TransportError
-from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Session
 from s2a_bench.harness.warnings import exchange_warnings
-from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
+from s2a_bench.plugins.chunks.acting import act, clients_of, plan_of, warm_up
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stall_metrics, stalls_of
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes
 from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksLive
 from s2a_bench.plugins.chunks.control import Acted
-from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
+from s2a_bench.plugins.chunks.latencies import Source, measured, write_delays
 from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester
@@ -101,16 +100,12 @@ class LiveResult:
 
 def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError."""
-    control, mode = config.control, next(iter(config.control.modes.values()))
-    plan = resolve(config.robots_requests, progress.say)
-    settings = {**plan.manifest["configuration"], **config.to_manifest()}
-    plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")
-    several = any(each.several for each in control.modes.values())
-    task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
+    plan = plan_of(config, f"a control loop at {config.control_hz:g} Hz", progress)
+    task = Task("chunks", drive=partial(_drive, config), clients=clients_of(config.control))
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
-        rows = delay_rows(next(measured(folder)), np.empty(0, np.int64), mode, config.setting)
-        write_delays(config.export_delays, rows)
+        mode = next(iter(config.control.modes.values()))
+        write_delays(config.export_delays, next(measured(folder)), np.empty(0, np.int64), mode, config.setting)
     return folder
 
 

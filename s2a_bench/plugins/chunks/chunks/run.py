@@ -14,7 +14,7 @@ from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mea
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes, draw
 from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
-from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
+from s2a_bench.plugins.chunks.latencies import write_delays
 from s2a_bench.plugins.chunks.modes import ControlSetting
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
@@ -94,5 +94,5 @@ def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path
                 writer.append(TRIGGERS, trigger_rows(mode, setting, latencies))
         writer.append(MEANS, mean_rows(config.control, first))
         if config.export_delays is not None:
-            write_delays(config.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
+            write_delays(config.export_delays, first.source, first.judged, plan.cells[0].mode, setting)
         return writer.path

@@ -137,7 +137,8 @@ class TriggerStepper(ChunkStepper):
     """Sets a stepper's trigger before each `ask`."""
 
     stepper: ChunkStepper
-    choose: Callable[[], int]
+    choose: Callable[[int], int]
+    """Returns the trigger of a request, by its number."""
     request_tick: int = 0
     triggers: list[int] = field(default_factory=list)
 
@@ -146,7 +147,7 @@ class TriggerStepper(ChunkStepper):
         self.past = self.stepper.past
 
     def ask(self, tick: int) -> bool:
-        self.stepper.trigger = self.choose()
+        self.stepper.trigger = self.choose(len(self.triggers))
         asks = self.stepper.ask(tick)
         if asks:
             self.request_tick = tick
@@ -164,11 +165,8 @@ class Varied(VaryingTrigger):
     triggers: tuple[int, ...]
 
     def stepper(self, setting: ControlSetting) -> ChunkStepper:
-        def choose() -> int:
-            return self.triggers[min(len(stepper.triggers), len(self.triggers) - 1)]
-
-        stepper = TriggerStepper(self.mode.stepper(setting), choose)
-        return stepper
+        last = len(self.triggers) - 1
+        return TriggerStepper(self.mode.stepper(setting), lambda request: self.triggers[min(request, last)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,12 +181,12 @@ class Learning(VaryingTrigger):
 
     def stepper(self, setting: ControlSetting) -> LearningStepper:
         rule, most = self.begin(), greatest_trigger(self.mode, setting)
-        length = self.mode.execution_horizon(setting)
+        stepper, length = self.mode.stepper(setting), self.mode.execution_horizon(setting)
 
-        def choose() -> int:
+        def choose(_request: int) -> int:
             return trigger(rule.caution, setting, most).ticks
 
-        return LearningStepper(self.mode.stepper(setting), choose, rule=rule, setting=setting, length=length)
+        return LearningStepper(stepper, choose, rule=rule, setting=setting, length=length)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -1,6 +1,7 @@
 """The experiment ``task``: success against latency, in virtual time or live."""
 
 from s2a_bench.experiments import Experiment, RunMode
+from s2a_bench.plugins.chunks import LIVE
 
 HERE = "s2a_bench.plugins.chunks.task"
 EXPERIMENT = Experiment(
@@ -9,14 +10,7 @@ EXPERIMENT = Experiment(
     config=f"{HERE}.config:TaskVirtual",
     run=f"{HERE}.virtual:run_virtual",
     mode="virtual",
-    modes=(
-        RunMode(
-            "live",
-            f"{HERE}.config:TaskLive",
-            f"{HERE}.live:run_live",
-            {"live": "act in real time on what a server answers; with --engine echo, --latency is how long that takes"},
-        ),
-    ),
+    modes=(RunMode("live", f"{HERE}.config:TaskLive", f"{HERE}.live:run_live", LIVE),),
     view=f"{HERE}.view:show",
     cell=f"{HERE}.rows:TaskCell",
     compared=f"{HERE}.rows:COMPARED",

@@ -9,9 +9,8 @@ from pathlib import Path
 from random import Random
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
-from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
+from s2a_bench.plugins.chunks.acting import act, clients_of, plan_of, warm_up
 from s2a_bench.plugins.chunks.options import ControlPlan
 from s2a_bench.plugins.chunks.task.config import TaskLive
 from s2a_bench.plugins.chunks.task.rows import EPISODES, episode_row
@@ -22,12 +21,8 @@ from s2a_bench.store.manifest import RunWarning
 def run_live(config: TaskLive, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError."""
     control = config.control
-    plan = resolve(config.robots_requests, progress.say)
-    settings = {**plan.manifest["configuration"], **config.to_manifest()}
-    hz = 1e9 / control.setting.period_ns
-    plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {hz:g} Hz")
-    several = any(each.several for each in control.modes.values())
-    task = Task("task", partial(_drive, config, control), CLIENTS if several else 1, (EPISODES,))
+    plan = plan_of(config, f"a control loop at {1e9 / control.setting.period_ns:g} Hz", progress)
+    task = Task("task", partial(_drive, config, control), clients_of(control), (EPISODES,))
     return run_requests(task, plan, output, progress)
 
 

@@ -80,7 +80,11 @@ def borne(judged: Sequence[TaskCell], margin: float) -> str:
 
 
 def share(cell: TaskCell) -> str:
-    return f"{cell.success:.0%} [{cell.success_low * 100:.0f}, {cell.success_high * 100:.0f}]"
+    return f"{cell.success:.0%} {_interval(cell.success_low, cell.success_high)}"
+
+
+def _interval(low: float, high: float) -> str:
+    return f"[{low * 100:.0f}, {high * 100:.0f}]"
 
 
 def task_table(cells: Sequence[TaskCell], robot: dict[str, str], margin: float, rounding: str) -> TextTable:
@@ -98,16 +102,9 @@ def task_table(cells: Sequence[TaskCell], robot: dict[str, str], margin: float, 
 def _entries(cell: TaskCell) -> tuple[str, ...]:
     lost = ABSENT
     if cell.lost is not None and cell.lost_low is not None and cell.lost_high is not None:
-        lost = f"{cell.lost * 100:.0f} [{cell.lost_low * 100:.0f}, {cell.lost_high * 100:.0f}]"
-    interval = f"[{cell.success_low * 100:.0f}, {cell.success_high * 100:.0f}]"
-    return (
-        number(cell.latency_s, 1e3),
-        str(cell.episodes),
-        f"{cell.success * 100:.0f}",
-        interval,
-        lost,
-        number(cell.duration_s),
-    )
+        lost = f"{cell.lost * 100:.0f} {_interval(cell.lost_low, cell.lost_high)}"
+    success = (f"{cell.success * 100:.0f}", _interval(cell.success_low, cell.success_high))
+    return number(cell.latency_s, 1e3), str(cell.episodes), *success, lost, number(cell.duration_s)
 
 
 def motion_table(cells: Sequence[TaskCell]) -> TextTable:
@@ -120,11 +117,7 @@ def motion_table(cells: Sequence[TaskCell]) -> TextTable:
 
 
 def _table(
-    title: str,
-    header: Sequence[str],
-    cells: Sequence[TaskCell],
-    entries: Iterable[Iterable[str]],
-    notes: Sequence[str],
+    title: str, header: Sequence[str], cells: Sequence[TaskCell], entries: Iterable[Iterable[str]], notes: Sequence[str]
 ) -> TextTable:
     rows = [(cell.mode, cell.source, *texts) for cell, texts in zip(cells, entries, strict=True)]
     groups = (group for _, group in groupby(rows, lambda row: row[0]))

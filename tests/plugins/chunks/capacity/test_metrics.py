@@ -119,13 +119,24 @@ def test_without_a_stall_the_share_is_below_that_of_events_that_were_not_seen(
     assert interval(np.ones(1000 * robots), robots, cycle) == pytest.approx((1 - high, 1))
 
 
+def by_chi_square(hits: float, variance: float, unseen: float) -> tuple[float, float]:
+    """Return the interval of a number of stalls as Fay and Feuer write it; one event of ``unseen`` more is possible."""
+    more, upper = hits + unseen, variance + unseen**2
+    low = variance / (2 * hits) * stats.chi2.ppf(0.025, 2 * hits**2 / variance)
+    return low, upper / (2 * more) * stats.chi2.ppf(0.975, 2 * more**2 / upper)
+
+
+def student(freedom: int) -> float:
+    """Return the factor by which so few degrees of freedom enlarge a variance."""
+    return float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2
+
+
 def test_four_times_have_the_interval_of_a_sum_of_events_of_unlike_size() -> None:
-    """Fay and Feuer's, by chi-square as they write it: events of 2 and 1 are seen, and one of 5 is not."""
+    """Events of 2 and 1 are seen, and one of 5 is not."""
     flags = np.zeros((4, 20), bool)
     flags[:2, 0] = flags[3, 10] = True
     at_ns, robots = np.tile(np.arange(20) // 5, 4), np.repeat(np.arange(4), 20)
-    low = 5 / (2 * 3) * stats.chi2.ppf(0.025, 2 * 3**2 / 5)
-    high = (5 + 25) / (2 * 8) * stats.chi2.ppf(0.975, 2 * 8**2 / 30)
+    low, high = by_chi_square(3, 5, unseen=5)
     assert share_interval(flags.ravel(), at_ns, robots, 1) == pytest.approx((low / 80, high / 80))
 
 
@@ -136,10 +147,7 @@ def test_what_is_within_a_cycle_is_one_event() -> None:
     apart[[100, 300, 500, 700]] = 1
     for flags, freedom, unseen in ((together, 1, 10), (apart, 3, 2.5)):
         blocks = flags.reshape(5, 200).sum(axis=1)
-        variance = 5 * blocks.var(ddof=1) * (stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2
-        low = variance / 8 * stats.chi2.ppf(0.025, 2 * 4**2 / variance)
-        mean, variance = 4 + unseen, variance + unseen**2
-        high = variance / (2 * mean) * stats.chi2.ppf(0.975, 2 * mean**2 / variance)
+        low, high = by_chi_square(4, 5 * blocks.var(ddof=1) * student(freedom), unseen)
         assert interval(flags, cycle=4) == pytest.approx((low / 1000, high / 1000))
 
 
@@ -148,10 +156,7 @@ def test_robots_that_differ_have_the_variance_between_them() -> None:
     flags = np.zeros((6, 1000))
     flags[0, 50::100] = 1
     variance = 6 / 5 * ((10 - 10 / 6) ** 2 + 5 * (10 / 6) ** 2)
-    variance *= (stats.t.ppf(0.975, 5) / stats.norm.ppf(0.975)) ** 2
-    low = variance / 20 * stats.chi2.ppf(0.025, 2 * 10**2 / variance)
-    mean, variance = 13.75, variance + 3.75**2
-    high = variance / (2 * mean) * stats.chi2.ppf(0.975, 2 * mean**2 / variance)
+    low, high = by_chi_square(10, variance * student(5), unseen=3.75)
     assert interval(flags, 6, cycle=4) == pytest.approx((low / 6000, high / 6000))
 
 

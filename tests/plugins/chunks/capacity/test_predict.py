@@ -28,6 +28,11 @@ def predicted(tmp_path: Path, **options: Any) -> StoredRun:
     return read_run(s2a.capacity(mode="predicted", output=tmp_path, seconds=5, settle_s=3, **options).path)
 
 
+def knee(run: StoredRun) -> tuple[int, int, int]:
+    ((robots, low, high),) = run.table(KNEES)[["robots", "low", "high"]].to_numpy().tolist()
+    return robots, low, high
+
+
 def test_the_engine_s_time_of_a_run_is_the_service_and_the_queue_is_no_part_of_it(make_run: MakeRun) -> None:
     cell = {"capture": 1.0, "queue": 5.0, "inference": 20.0, "return": 2.0}
     run = make_run({"ours": cell, "theirs": BLACK_BOX}, n=4, spread=0)
@@ -87,8 +92,7 @@ def test_what_cannot_be_predicted_is_one_line(tmp_path: Path, options: dict[str,
 
 def test_the_knee_of_a_queue_is_exact(tmp_path: Path) -> None:
     run = predicted(tmp_path, predict="20", modes="queue?trigger=2", robots="1..64")
-    (knee,) = run.table(KNEES).to_dict("records")
-    assert (knee["source"], knee["robots"], knee["low"], knee["high"]) == ("predicted", 16, 16, 16)
+    assert knee(run) == (16, 16, 16)
     fleets = run.table(FLEETS).set_index("robots")
     assert set(fleets["source"]) == {"predicted"}
     assert fleets["stalled"][16] == 0
@@ -98,11 +102,11 @@ def test_the_knee_of_a_queue_is_exact(tmp_path: Path) -> None:
 
 def test_the_predicted_knee_is_the_median_of_five_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options: Any = {"predict": "lognormal:mean_ms=20,cv=1", "robots": "1..64", "modes": "queue?trigger=8"}
-    (median,) = predicted(tmp_path / "all", **options, seed=7).table(KNEES).to_dict("records")
+    median, low, _ = knee(predicted(tmp_path / "all", **options, seed=7))
     monkeypatch.setattr(predict, "SEEDS", 1)
     alone = [predicted(tmp_path / str(seed), **options, seed=seed).table(KNEES)["robots"][0] for seed in range(7, 12)]
     assert len({*alone}) > 2, alone
-    assert median["robots"] == median["low"] == sorted(alone)[2]
+    assert median == low == sorted(alone)[2]
 
 
 def test_the_limit_of_sync_is_on_what_is_beyond_one_robot_alone(tmp_path: Path) -> None:
@@ -110,15 +114,13 @@ def test_the_limit_of_sync_is_on_what_is_beyond_one_robot_alone(tmp_path: Path) 
     fleets = run.table(FLEETS).set_index("robots")
     assert fleets["stalled_alone"][40] == fleets["stalled"][1] == pytest.approx(1 / 17, abs=0.01)
     assert fleets["within"].tolist() == [True, True, False]
-    (knee,) = run.table(KNEES).to_dict("records")
-    assert (knee["robots"], knee["low"], knee["high"]) == (2, 2, 39)
-    assert knee["limit"] == "at most 1 % stalled ticks beyond those of one robot alone"
+    assert knee(run) == (2, 2, 39)
+    assert run.table(KNEES)["limit"].tolist() == ["at most 1 % stalled ticks beyond those of one robot alone"]
 
 
 def test_no_robot_is_predicted_where_one_leaves_no_room_and_nothing_where_nothing_is_known(tmp_path: Path) -> None:
     full = predicted(tmp_path / "full", predict="700", modes="sync", robots="1..8", limit="stalled=50%")
-    (knee,) = full.table(KNEES).to_dict("records")
-    assert (knee["robots"], knee["low"], knee["high"]) == (0, 0, 0)
+    assert knee(full) == (0, 0, 0)
     slow = predicted(tmp_path / "slow", predict="20000", modes="sync", robots="1..8", limit="latency_p99=30s")
     assert slow.table(KNEES)["robots"].tolist() == [0]
     assert slow.table(KNEES)["high"].isna().all()
@@ -127,8 +129,7 @@ def test_no_robot_is_predicted_where_one_leaves_no_room_and_nothing_where_nothin
 def test_one_robot_is_tried_before_a_range_that_begins_with_more(tmp_path: Path) -> None:
     run = predicted(tmp_path, predict="25", robots="16..32")
     assert run.table(FLEETS)["robots"].tolist() == [1, 16]
-    (knee,) = run.table(KNEES).to_dict("records")
-    assert (knee["robots"], knee["low"], knee["high"]) == (1, 1, 15)
+    assert knee(run) == (1, 1, 15)
 
 
 def test_clients_without_a_clock_and_plans_are_predicted(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +23,13 @@ from s2a_bench.testing import NullProgress
 from s2a_bench.writers.style import paper_column
 
 
+def ran(folder: Path, **options: Any) -> StoredRun:
+    return read_run(run_virtual(ChunksVirtual(**options), folder, NullProgress()))
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = ChunksVirtual(latency="60,lognormal:mean_ms=80,cv=.5", cycles=600)
-    return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
+    return ran(tmp_path_factory.mktemp("chunks"), latency="60,lognormal:mean_ms=80,cv=.5", cycles=600)
 
 
 def drawn(run: StoredRun, name: str) -> Figure:
@@ -44,13 +48,7 @@ def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> No
         assert "floor" in table.title
         assert any(note.startswith("d = floor(L / Delta t)") for note in table.notes)
     sync = dict(zip(stalls.header, stalls.rows[0], strict=True))
-    assert (sync["s"], sync["m"], sync["longest"], sync["form"], sync["margin"]) == (
-        "16",
-        "\N{EN DASH}",
-        "3",
-        "100",
-        "-1",
-    )
+    assert [sync[name] for name in ("s", "m", "longest", "form", "margin")] == ["16", "\N{EN DASH}", "3", "100", "-1"]
 
 
 def test_sentences_say_what_each_rule_costs(run: StoredRun) -> None:
@@ -66,13 +64,8 @@ def test_csv_has_every_row_with_its_provenance(run: StoredRun) -> None:
 
 
 def test_lanes_show_the_modes_and_the_calibrated_trigger(run: StoredRun) -> None:
-    assert [lane.title for lane in lanes_of(run, ChunkCells.of(run))[:5]] == [
-        "sync",
-        "queue?trigger=6",
-        "replace",
-        "aggregate?trigger=6",
-        "queue, calibrated",
-    ]
+    titles = [lane.title for lane in lanes_of(run, ChunkCells.of(run))]
+    assert titles[:5] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6", "queue, calibrated"]
     axes = drawn(run, "lanes").axes[0]
     (ages,) = axes.child_axes
     curve, at = next(line for line in axes.lines if len(line.get_xdata()) > 2), ages.get_yticks()
@@ -102,23 +95,21 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
 
 def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path) -> None:
     assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions"]
-    config = ChunksVirtual(modes="sync", cycles=20, shown_ticks=0)
-    run = read_run(run_virtual(config, tmp_path, NullProgress()))
+    run = ran(tmp_path, modes="sync", cycles=20, shown_ticks=0)
     assert list(EXPERIMENT.show(run).figures) == ["stability", "reactions"]
 
 
 @pytest.mark.parametrize("modes", ["sync", "sync,replace"])
 def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
-    config = ChunksVirtual(latency="60", modes=modes, rules="", cycles=100)
-    few = read_run(run_virtual(config, tmp_path, NullProgress()))
+    few = ran(tmp_path, latency="60", modes=modes, rules="", cycles=100)
     assert len(lanes_of(few, ChunkCells.of(few))) == modes.count(",") + 1
     drawn(few, "lanes").savefig(tmp_path / "lanes.png")  # a warning where they have none
 
 
 @pytest.fixture(scope="module")
 def lanes_run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
-    return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
+    options = {"modes": "sync,replace?execute=8", "latency": "60,100", "cycles": 100, "shown_ticks": 60}
+    return ran(tmp_path_factory.mktemp("chunks"), **options)
 
 
 def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(lanes_run: StoredRun) -> None:

@@ -1,8 +1,7 @@
-"""Every closed form against robots in continuous time: exact where nothing is random, and where it stops to hold."""
+"""Every closed form against the modes in virtual time: exact where nothing is random, and where it stops to hold."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -14,18 +13,10 @@ from scipy import stats
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Rounding, mode
 from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
 from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
-from s2a_bench.plugins.chunks.modes.closed import (
-    Closed,
-    appended,
-    replace_stall_share,
-    slow_down,
-    stall_share,
-)
+from s2a_bench.plugins.chunks.modes.closed import Closed, appended, replace_stall_share, slow_down, stall_share
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from s2a_bench.policy.schedule import safe_start
 from tests.conftest import examples
-from tests.plugins.chunks.modes.drawn import plainly
-from tests.plugins.chunks.modes.plain import Log
 
 PERIOD = 20
 ROUNDINGS = st.sampled_from(["floor", "ceil"])
@@ -36,54 +27,37 @@ def constant(latency: int, requests: int = 8) -> Any:
     return np.full(requests, latency, np.int64)
 
 
-def boundaries(log: Log) -> list[int]:
-    """Return the stalled ticks before each chunk but the first, of those that are executed."""
-    found, idle, last = [], 0, -1
-    for act in log.acts:
-        if act is None:
-            idle += 1
-            continue
-        if act[0] != last:
-            found.append(idle)
-        last, idle = act[0], 0
-    return found[1:]
+# (a) queue and sync, (b) replace, (c) reaction
 
 
-def ages(log: Log, skip: int) -> list[int]:
-    """Return the ages of the executed actions of whole cycles after the first ``skip`` chunks."""
-    left_at = [at // PERIOD for at in log.asked_ns]
-    last = len(left_at) - 1
-    acted = [(act[0], tick) for tick, act in enumerate(log.acts) if act is not None]
-    return [tick - left_at[chunk] for chunk, tick in acted if skip <= chunk < last]
-
-
-def spread(values: list[int]) -> tuple[float, float, float]:
-    return min(values), float(np.mean(values)), max(values)
-
-
-# (a) queue and sync
+@st.composite
+def cases_at_a_constant_latency(draw: st.DrawFn) -> tuple[Mode, int, ControlSetting]:
+    horizon = draw(st.integers(1, 14))
+    execute, trigger = draw(st.integers(1, horizon)), draw(st.integers(0, 12))
+    streamed = Streamed(trigger, execute, draw(st.integers(0, 50)) * 1e-9)
+    replaces = (Replace(execute), Replace(execute, "many"))
+    made = draw(st.sampled_from([Sync(execute), Queue(trigger, execute), streamed, *replaces, Aggregate(trigger)]))
+    return made, draw(st.integers(0, 400)), ControlSetting(PERIOD, horizon, draw(ROUNDINGS))
 
 
 @steady
-@given(
-    latency=st.integers(0, 400),
-    trigger=st.integers(0, 8),
-    extra=st.integers(1, 6),
-    rounding=ROUNDINGS,
-    rest=st.integers(0, 3),
-)
-def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
-    latency: int, trigger: int, extra: int, rounding: Rounding, rest: int
-) -> None:
-    s = trigger + extra
-    setting = ControlSetting(PERIOD, s + rest, rounding)
-    log = plainly(Queue(trigger, s), constant(latency), setting)
-    delay = int(setting.delay_ticks(np.array(latency)))
-    assert boundaries(log) == [max(0, delay - trigger)] * 7
-    first = max(delay, trigger)  # nothing is skipped
-    assert spread(ages(log, 1)) == (first, first + (s - 1) / 2, first + s - 1)
-    none_from = math.ceil(latency / PERIOD) if rounding == "ceil" else latency // PERIOD
-    assert (boundaries(log)[0] == 0) == (trigger >= none_from)
+@given(case=cases_at_a_constant_latency())
+def test_in_the_steady_state_each_cycle_is_that_of_the_closed_form(case: tuple[Mode, int, ControlSetting]) -> None:
+    """What a stall takes, an action's age and a reaction follow: the wait w and the cycle c of the next request."""
+    made, latency, setting = case
+    form, cycles = made.closed_form(constant(latency), setting), made.cycles(constant(latency, 60), setting)
+    settled, lasts = slice(40, 50), np.diff(cycles.request_tick)[40:50].tolist()
+    if form.p_stall is not None:
+        stalls = cycles.executed[settled] < lasts  # no boundary where a chunk is all past when it arrives
+        assert stalls.tolist() == [form.p_stall == 1] * 10
+    if form.wait_ticks is not None and form.cycle_ticks is not None:
+        wait, cycle = form.wait_ticks[0], form.cycle_ticks[0]
+        s = made.execution_horizon(setting)
+        known = int(setting.known_ticks(np.array(latency + (s - 1) * made.gap_ns)))
+        assume(not made.trigger or s != max(1, known))  # else the queue never fills up to its trigger
+        assert (cycles.start_tick - cycles.request_tick)[settled].tolist() == [wait] * 10
+        assert lasts == [cycle] * 10
+        assert form.mean_reaction_ticks == wait + cycle / 2
 
 
 @steady
@@ -94,18 +68,16 @@ def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
     gap=st.integers(0, 50),
     rounding=ROUNDINGS,
 )
-def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_too(
+def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by_and_answers_take_longer_than_they_last(
     latency: int, trigger: int, s: int, gap: int, rounding: Rounding
 ) -> None:
     setting = ControlSetting(PERIOD, 9, rounding)
     made = Streamed(trigger, s, gap * 1e-9)
-    log = plainly(made, constant(latency, 60), setting)
     ready = int(setting.delay_ticks(np.array(latency))) + made.hold_ticks(setting)
     known = int(setting.known_ticks(np.array(latency + (s - 1) * gap)))
-    assert boundaries(log)[40] == max(0, ready - trigger, known - s)  # against known - s no trigger helps
-
-
-# (b) replace
+    cycles = made.cycles(constant(latency, 60), setting)
+    assert cycles.stall_ticks[40] == max(0, ready - trigger, known - s)  # against known - s no trigger helps
+    assert cycles.executed[40] == s  # nothing is skipped
 
 
 @steady
@@ -117,55 +89,17 @@ def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_
     under_way=st.sampled_from(["one", "many"]),
 )
 def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
-    latency: int, s: int, rest: int, rounding: Rounding, under_way: str
+    latency: int, s: int, rest: int, rounding: Rounding, under_way: Any
 ) -> None:
     setting = ControlSetting(PERIOD, s + rest, rounding)
-    log = plainly(Replace(s, under_way), constant(latency, 24), setting)  # type: ignore[arg-type]
+    cycles = Replace(s, under_way).cycles(constant(latency, 60), setting)
     delay, known = (int(each(np.array(latency))) for each in (setting.delay_ticks, setting.known_ticks))
     cycle = max(s, known) if under_way == "one" else s
-    assume(under_way == "one" or known <= 8 * s)  # else none of a few requests arrives before the last one leaves
     stall = min(cycle, max(0, cycle + delay - setting.horizon))
-    acted = [act is not None for act in log.acts]
-    from_tick = log.asked_ns[10] // PERIOD
-    window = acted[from_tick : from_tick + cycle]
-    assert cycle - sum(window) == stall
-    if under_way == "many" or known <= s:
-        assert (stall == 0) == (s + delay <= setting.horizon)
+    assert cycles.executed[25:35].tolist() == [cycle - stall] * 10
     if delay < setting.horizon:
-        last = min(cycle + delay, setting.horizon) - 1
-        left_at = [at // PERIOD for at in log.asked_ns]
-        found = [
-            tick - left_at[act[0]] for tick, act in enumerate(log.acts) if act and from_tick <= tick < from_tick + cycle
-        ]
-        assert spread(found) == (delay, (delay + last) / 2, last)
-
-
-# (c) reaction
-
-
-@steady
-@given(latency=st.integers(0, 300), s=st.integers(1, 9), trigger=st.integers(0, 5), name=st.sampled_from("qrsa"))
-def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigger: int, name: str) -> None:
-    setting = ControlSetting(PERIOD, 18, "ceil")
-    made: Mode = {"q": Queue(trigger, s + trigger), "r": Replace(s, "many"), "s": Sync(s), "a": Aggregate(trigger)}[
-        name
-    ]
-    assume(name != "r" or latency <= 8 * PERIOD)
-    log = plainly(made, constant(latency, 24), setting)
-    delay = -(-latency // PERIOD)
-    wait = max(delay, trigger) if name == "q" else delay
-    late = max(0, delay - trigger)
-    cycle = {"q": s + trigger + late, "r": s, "s": s + delay, "a": 18 - trigger + late}[name]
-    first = {}
-    for act, at in zip(log.acts, log.acted_ns, strict=True):
-        if act is not None:
-            first.setdefault(act[0], at)
-    moments = range(log.asked_ns[4] + 1, log.asked_ns[5] + 1)
-    left_at = log.asked_ns[5]
-    reactions = [first[5] - moment for moment in moments]
-    assert left_at == max(moments)
-    assert (min(reactions), max(reactions) + 1) == (wait * PERIOD, (wait + cycle) * PERIOD)
-    assert np.mean(reactions) + 0.5 == (wait + cycle / 2) * PERIOD  # moments are whole ns
+        assert cycles.stall_ticks[25:35].tolist() == [stall] * 10
+        assert cycles.first_index[25:35].tolist() == [delay] * 10  # ages from d on
 
 
 # (d) streamed
@@ -180,12 +114,7 @@ def test_the_start_of_a_streamed_chunk_is_the_safe_start_of_its_plan(
     assert start_s[0] == pytest.approx((first + (horizon - 1) * max(0, gap - period)) / 1e9, abs=1e-9)
 
 
-@given(
-    latency=st.integers(0, 200),
-    gap=st.integers(0, 60),
-    rounding=ROUNDINGS,
-    s=st.integers(1, 9),
-)
+@given(latency=st.integers(0, 200), gap=st.integers(0, 60), rounding=ROUNDINGS, s=st.integers(1, 9))
 def test_a_safe_start_is_never_early_and_at_most_a_tick_late(
     latency: int, gap: int, rounding: Rounding, s: int
 ) -> None:
@@ -215,13 +144,7 @@ def within(stalls: int, count: int, probability: float) -> bool:
 
 
 MS = 1_000_000
-RANDOM = [
-    (Queue(4, 8), 4),
-    (Queue(5, 16), 5),
-    (Aggregate(3), 3),
-    (Aggregate(7), 7),
-    (Replace(12, "one"), 4),
-]
+RANDOM = [(Queue(4, 8), 4), (Queue(5, 16), 5), (Aggregate(3), 3), (Aggregate(7), 7), (Replace(12, "one"), 4)]
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
@@ -278,7 +201,6 @@ def test_slowed_down_by_beta_no_cycle_stalls_and_by_less_each_does(
 ) -> None:
     horizon = s + rest
     slack = Replace(s, under_way).slack(ControlSetting(1000, horizon, rounding))
-    beta = slow_down(latency / 1e9, slack, 1e-6)
     # Ticks of 1000 ns, so that rounding to whole ns is little.
     latency_ns = constant(latency * 1000, 30)
     beta = slow_down(latency * 1e-6, slack, 1e-6)
@@ -318,19 +240,7 @@ def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
     delay = int(setting.delay_ticks(np.array(latency)))
     made = Replace(s, "one", assumed)
     assume(max(s, -(-latency // PERIOD)) + assumed <= 16)
-    log = plainly(made, constant(latency), setting)
-    takeovers = [
-        tick for tick in range(1, len(log.acts)) if (log.acts[tick] or (0, 0))[0] > (log.acts[tick - 1] or (0, 0))[0]
-    ]
-    assert takeovers
-    for tick in takeovers:
-        chunk, index = log.acts[tick] or (0, 0)
-        left_at = log.asked_ns[chunk] // PERIOD
-        done = sum(act is not None for act in log.acts[left_at:tick])
-        assert abs(index - done) == abs(assumed - delay)
-    assert set(
-        np.abs(mode(f"replace?execute={s}&assumed={assumed}").cycles(constant(latency), setting).jump[1:-1])
-    ) == {abs(assumed - delay)}
+    assert made.cycles(constant(latency), setting).jump[1:-1].tolist() == [assumed - delay] * 6
 
 
 @pytest.mark.parametrize(

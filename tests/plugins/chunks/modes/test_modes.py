@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,79 @@ from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, mode
-from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
-from s2a_bench.plugins.chunks.modes.append import Queue, Sync, VariedQueue
+from s2a_bench.plugins.chunks.modes.aggregate import WEIGHTS, Aggregate
+from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync, VariedQueue
 from s2a_bench.plugins.chunks.modes.cycles import follow, step
 from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reaction_ticks
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from s2a_bench.plugins.chunks.modes.trigger import Varied
 from s2a_bench.plugins.chunks.testing.mode import ModeSuite
 from tests.conftest import examples
-from tests.plugins.chunks.modes.drawn import agree, cases, latencies, modes, plainly, settings_of_chunks
+from tests.plugins.chunks.modes.plain import Aggregates, Appends, Log, Replaces
 
 named = pytest.mark.parametrize("name", MODES)
 many = settings(max_examples=examples(300))
+
+
+def agree(some: tuple[Any, ...], others: tuple[Any, ...]) -> None:
+    """Compare arrays field by field."""
+    for one, other in zip(some, others, strict=True):
+        for field in fields(one):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), field.name)
+
+
+@st.composite
+def settings_of_chunks(draw: st.DrawFn) -> ControlSetting:
+    return ControlSetting(
+        draw(st.sampled_from([1, 2, 7, 20])), draw(st.integers(1, 10)), draw(st.sampled_from(["floor", "ceil"]))
+    )
+
+
+@st.composite
+def latencies(draw: st.DrawFn, setting: ControlSetting) -> Any:
+    most = draw(st.sampled_from([1, 2, setting.horizon, 3 * setting.horizon])) * setting.period_ns
+    return np.array(draw(st.lists(st.integers(0, most), max_size=12)), np.int64)
+
+
+@st.composite
+def modes(draw: st.DrawFn, setting: ControlSetting, name: str) -> Mode:
+    execute, trigger = st.integers(1, setting.horizon), st.integers(0, setting.horizon + 2)
+    if name == "sync":
+        return mode(f"sync?execute={draw(execute)}")
+    if name == "queue":
+        return mode(f"queue?trigger={draw(trigger)}&execute={draw(execute)}")
+    if name == "streamed":
+        gap = draw(st.integers(0, 3 * setting.period_ns)) * 1e-9
+        return Streamed(draw(trigger), draw(execute), gap, draw(st.sampled_from(["safe", "naive"])))
+    if name == "replace":
+        under_way = draw(st.sampled_from(["one", "many"]))
+        return mode(f"replace?execute={draw(execute)}&under_way={under_way}&assumed={draw(st.integers(-1, 11))}")
+    return mode(f"aggregate?trigger={draw(trigger)}&kind={draw(st.sampled_from(list(WEIGHTS)))}")
+
+
+@st.composite
+def cases(draw: st.DrawFn, name: str) -> tuple[Mode, Any, ControlSetting]:
+    setting = draw(settings_of_chunks())
+    return draw(modes(setting, name)), draw(latencies(setting)), setting
+
+
+def plainly(made: Mode, latency_ns: Any, setting: ControlSetting) -> Log:
+    common = (latency_ns.tolist(), setting.period_ns, setting.horizon, setting.rounding, made.gap_ns)
+    match made:
+        case Sync():
+            return Appends(*common, execute=made.execution_horizon(setting)).run()
+        case Queue():
+            return Appends(*common, trigger=made.trigger, execute=made.execution_horizon(setting)).run()
+        case Streamed():
+            length = made.execution_horizon(setting)
+            behind = max(0, (length - 1) * (made.gap_ns - setting.period_ns)) if made.start == "safe" else 0
+            hold = -(-behind // setting.period_ns)
+            return Appends(*common, trigger=made.trigger, execute=length, hold=hold).run()
+        case Replace():
+            return Replaces(*common, execute=made.execute, many=made.under_way == "many", assumed=made.assumed).run()
+        case Aggregate():
+            return Aggregates(*common, trigger=made.trigger, weight=WEIGHTS[made.kind]).run()
+    raise AssertionError(made.name)
 
 
 @named
@@ -196,6 +258,8 @@ def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
 def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case
     agree((mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)), step(mode, latency_ns, setting))
+    without_arrays = Varied(mode.mode, mode.triggers)
+    agree((without_arrays.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))
 
 
 @given(case=varied())
@@ -205,13 +269,6 @@ def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, ControlSetting]) 
     assert isinstance(queue, Queue)
     same = VariedQueue(mode.mode, mode.triggers[:1])
     agree((same.cycles(latency_ns, setting),), (queue.cycles(latency_ns, setting),))
-
-
-@given(case=varied())
-def test_a_mode_without_arrays_of_its_own_does_the_same(case: tuple[Varied, Any, ControlSetting]) -> None:
-    mode, latency_ns, setting = case
-    stepped = Varied(mode.mode, mode.triggers)
-    agree((stepped.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))
 
 
 SETTING = ControlSetting(10, 4)

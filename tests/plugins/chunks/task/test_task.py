@@ -107,38 +107,21 @@ def test_what_it_says_is_what_its_rows_hold(run: StoredRun) -> None:
     assert list(show(run).sentences) == [f"{name}: bears 20 ms: {within}" for name in SHARED["modes"]]
 
 
-@pytest.mark.parametrize(
-    ("name", "horizon", "ticks", "latency_s", "stalled", "age"),
-    [
-        ("sync", 9, 60, 0.15, 4 * 3, 3 + 4),  # cycles of 3 + 9 ticks
-        ("queue?trigger=3", 9, 3 + 6 * 9, 0.15, 0, 3 + 4),
-        ("replace?execute=1&under_way=many&assumed=0", 1, 40, 0.15, 3, 3),
-        ("replace?execute=4", 9, 10 + 5 * 4, 0.15, 0, (sum(range(3, 10)) + 5 * sum(range(3, 7))) / (7 + 5 * 4)),
-        ("streamed?gap_s=.1", 4, 3 * 10, 0.45, 2 * 6, 6 + 1.5),  # it holds back for 3 ticks
-        ("streamed?gap_s=.1&start=naive", 4, 3 * 10, 0.45, 3 * 3 + 2 * 3, (3 + 5 + 7 + 9) / 4),
-    ],
-)
-def test_stalls_and_ages_at_a_latency_of_three_ticks_are_those_of_the_closed_form(
-    tmp_path: Path, name: str, horizon: int, ticks: int, latency_s: float, stalled: int, age: float
-) -> None:
-    options: dict[str, Any] = {"robot": PENDULUM, "latency": "150", "modes": name, "horizon": horizon}
-    (row,) = ran(tmp_path, "swing", steps=ticks, episodes=1, **options).table(EPISODES).to_dict("records")
-    assert (row["ticks"], row["stall_ticks"]) == (ticks, stalled)
-    assert row["age_ticks"] == pytest.approx(age)
-    assert row["latency_s"] == pytest.approx(latency_s)
-
-
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_the_ticks_of_an_episode_are_those_of_its_mode_s_arrays(tmp_path: Path, rounding: Rounding) -> None:
     options: dict[str, Any] = {"robot": PENDULUM, "latency": "0,70,180", "rounding": rounding, "horizon": 10}
-    asked = ["sync", "queue?trigger=2", "replace?execute=3", "streamed?gap_s=.02"]
+    asked = ["sync", "queue?trigger=2", "replace?execute=3", "replace?execute=1&under_way=many&assumed=0"]
+    asked += ["streamed?gap_s=.02", "streamed?gap_s=.1", "streamed?gap_s=.1&start=naive"]
     setting = ControlSetting(50_000_000, 10, rounding)
     rows = ran(tmp_path, "swing", modes=asked, steps=73, episodes=1, **options).table(EPISODES)
-    assert len(rows) == 12
+    assert len(rows) == 3 * len(asked)
     for row in rows.to_dict("records"):
-        ticks = mode(row["mode"]).ticks(np.full(99, int(row["latency"]) * 1_000_000), setting)
+        made = mode(row["mode"])
+        ticks = made.ticks(np.full(99, int(row["latency"]) * 1_000_000), setting)
+        assert row["ticks"] == 73
         assert row["stall_ticks"] == ticks.stalled[:73].sum(), row["cell"]
         assert row["age_ticks"] == pytest.approx(ticks.age[:73][ticks.chunk[:73] >= 0].mean()), row["cell"]
+        assert row["latency_s"] == pytest.approx(int(row["latency"]) / 1e3 + 9 * made.gap_ns / 1e9)
 
 
 def case(written: str, name: str = "sync", seed: int = 0) -> TaskCase:

@@ -220,23 +220,15 @@ def build_triggers(
         closed = [(row.trigger, max(row.p_stall_closed, floor)) for row in mine if row.p_stall_closed is not None]
         axes.plot(*np.array(closed).reshape(-1, 2).T, color=colour, linewidth=0.9)
         lines += axes.plot([], [], color=colour, label=short(name, LINE_CHARS - 8))
-        axes.errorbar(
-            [row.trigger for row in mine],
-            [max(row.p_stall_cycle, floor) for row in mine],
-            [
-                [max(row.p_stall_cycle - row.p_stall_low, 0) for row in mine],
-                [max(row.p_stall_high - row.p_stall_cycle, 0) for row in mine],
-            ],
-            fmt=".",
-            color=colour,
-            markersize=3,
-            elinewidth=0.5,
-        )
+        shares = np.array([(row.p_stall_cycle, row.p_stall_low, row.p_stall_high) for row in mine])
+        share, low, high = shares.reshape(-1, 3).T
+        ends, at = np.maximum([share - low, high - share], 0), [row.trigger for row in mine]
+        axes.errorbar(at, np.maximum(share, floor), ends, fmt=".", color=colour, markersize=3, elinewidth=0.5)
         for rule, marker in _RULES.items():
             for cell in cells:
                 if cell.rule == rule and cell.trigger is not None:
-                    at = max(cell.p_stall_cycle or 0.0, floor)
-                    axes.plot(cell.trigger, at, marker, color=colour, markerfacecolor="none", markersize=7)
+                    stalled = max(cell.p_stall_cycle or 0.0, floor)
+                    axes.plot(cell.trigger, stalled, marker, color=colour, markerfacecolor="none", markersize=7)
     for rule, marker in _RULES.items():
         if any(cell.rule == rule for _, cells in groups for cell in cells):
             style: dict[str, Any] = {"markerfacecolor": "none", "markersize": 6, "linestyle": "none"}
