@@ -69,7 +69,12 @@ def appended(ready: Ints, known: Ints, trigger: int, length: int) -> Closed:
     """Return the closed forms of appended chunks, if the next request never has to wait for the answer."""
     wait = np.maximum(ready, trigger)
     cycle = wait + length - trigger
-    return Closed() if (cycle < np.maximum(known, 1)).any() else Closed(stall_share(ready, trigger), wait, cycle)
+    spare = cycle - np.maximum(known, 1)
+    if (spare < 0).any():
+        return Closed()
+    p_stall = stall_share(ready, trigger)
+    # without spare ticks a queue that begins below its trigger never fills up to it, so waits are shorter
+    return Closed(p_stall) if (spare[ready < trigger] == 0).any() else Closed(p_stall, wait, cycle)
 
 
 def beta(mode: Mode, latency_ns: Ints, setting: ControlSetting, epsilon: float) -> float | None:
