@@ -57,8 +57,8 @@ def change_warnings(name: str, learned: Rows, seen: Rows, unit: str, advice: str
         return []
     before, now = (float(np.median(rows.values)) for rows in (learned, seen))
     what = (
-        f"{name}: delays changed since the calibration, in the median from {before:.4g} to {now:.4g} {unit} "
-        f"(P(a later one is longer) = {change.superiority.value:.2f})"
+        f"{name}: delays changed since the calibration: a later one is longer with probability "
+        f"{change.superiority.value:.2f}; medians {before:.4g} and {now:.4g} {unit}"
     )
     return [RunWarning("delays-changed", what, advice)]
 

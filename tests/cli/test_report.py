@@ -65,7 +65,8 @@ def test_a_folder_is_all_runs_in_it_and_what_is_no_run_is_skipped(
     called("report", folder)
     assert re.findall(r"<h2>.*, 2026-01-0(\d)", Path("report.html").read_text()) == ["2", "3"]
     monkeypatch.setattr("s2a_bench.report.page.chapters.MOST_RUNS", 1)
-    assert f"{folder} holds 2 runs: the latest 1 are used; name the folders of others" in called("report", folder).stderr
+    said = f"{folder} holds 2 runs: the latest 1 are used; name the folders of others"
+    assert said in called("report", folder).stderr
     assert re.findall(r"<h1>.*, 2026-01-0(\d)", Path("report.html").read_text()) == ["3"]
 
 

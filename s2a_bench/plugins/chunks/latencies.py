@@ -44,6 +44,8 @@ class Source:
     """Measured requests, as the columns of `COLUMNS`."""
     service_ns: Ints | None = None
     """Service times of measured requests, as `service_of`: shape (R, 3)."""
+    horizons: tuple[int, ...] = ()
+    """How many actions measured answers have; empty for tokens."""
 
     @property
     def provenance(self) -> Provenance:
@@ -109,15 +111,17 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
         if only and only not in cells:
             raise UsageError(f"`latency`: {folder} has no cell '{only}', only {', '.join(cells)}")
         spans = _pieces(run)
+        actions = run.manifest["configuration"].get("engine", {}).get("answer") == "actions"
         for cell in [only] if only else cells:
-            answered = run.origins.of(cell)
-            timed = [_request(row, run, spans) for row in good[good["cell"] == cell].to_dict("records")]
+            answered, of_cell = run.origins.of(cell), good[good["cell"] == cell]
+            timed = [_request(row, run, spans) for row in of_cell.to_dict("records")]
             yield Source(
                 f"{folder}#{cell}{answered.over}",
                 recorded_ns=np.array([request["latency_ns"] for request, _ in timed], np.int64),
                 origin=Provenance.computed("", answered.weights, answered.pictures),
                 requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request, _ in timed),
                 service_ns=np.array([service for _, service in timed], np.int64),
+                horizons=tuple(sorted(of_cell["n_tokens"].unique().tolist())) if actions else (),
             )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.requests import span_of
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
@@ -47,6 +48,10 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
     if config.learnt and (missing := ", ".join(rule for rule in config.rules if rule not in rules.tried)):
         few = f"without the rules {missing}: {config.too_few}"
         warnings = [RunWarning("few-latencies", few, "record more, or raise --eps"), *warnings]
+    for source in config.sources:
+        if source.horizons and source.horizons != (setting.horizon,):
+            about = f"answers of {source.name} have {span_of(source.horizons)} actions, not {setting.horizon}"
+            warnings.append(RunWarning("other-horizon", about, "set `horizon`, and `control_hz`, to the policy's"))
     for each in {cell.latencies.source.name: cell.latencies for cell in tried if cell.rule in PROMISING}.values():
         name, recorded = each.source.name, each.source.recorded_ns is not None
         if recorded and (changed := changes(setting, name, each)):

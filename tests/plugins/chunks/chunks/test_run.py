@@ -25,8 +25,12 @@ from s2a_bench.plugins.chunks.modes.closed import Closed, closed
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.cli.program import called, printed
+from tests.made_runs import MakeRun
 
 LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
+
+
+ACTIONS = {"engine": {"name": "echo", "answer": "actions"}}
 
 
 def ran(folder: Path, **options: Any) -> StoredRun:
@@ -210,6 +214,22 @@ def test_a_short_recording_has_no_rule_that_promises(tmp_path: Path) -> None:
     for way_out in ({"epsilon": 0.04}, {"rules": others}):
         config = ChunksVirtual(latency=str(file), **way_out)
         assert config.sources[0].learnable(config.learnt) == 25
+
+
+@pytest.mark.parametrize(("horizon", "codes"), [(16, ["other-horizon"]), (15, [])])
+def test_a_policy_of_another_horizon_raises_a_warning(
+    horizon: int, codes: list[str], make_run: MakeRun, tmp_path: Path
+) -> None:
+    measured = make_run(
+        {"loopback": {"convert": 1, "inference": 80, "return": 0}},
+        n=6,
+        n_tokens=15,
+        manifest={"configuration": ACTIONS},
+    )
+    run = ran(tmp_path / "chunks", latency=str(measured.path), rules="", horizon=horizon)
+    assert [warning["code"] for warning in run.manifest["warnings"]] == codes
+    for warning in run.manifest["warnings"]:
+        assert warning["message"].endswith("#loopback have 15 actions, not 16")
 
 
 def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: Path) -> None:

@@ -39,7 +39,8 @@ _TITLES: Final = {"execution_horizon": "s", "trigger": "m", **{name: metric.titl
 _SCALES: Final = {"s": 1e3, "bytes/s": 1e-6}
 """Unit -> factor: tables show times in ms, bytes in MB."""
 _EMULATED: Final = Note(
-    "EMULATED: ticks are counted in virtual time, with given latencies; nothing was measured.", EMULATED
+    "EMULATED: ticks of virtual time, with the latencies of each row; no loop was measured.",
+    EMULATED,
 )
 
 
