@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = "s2a_bench"
 BESIDE = ("studies", "tools", "benchmarks", "tests")
-BUDGETS = {"s2a_bench": 57_830, "core": 41_010, "tests": 51_220}
+BUDGETS = {"s2a_bench": 58_180, "core": 41_390, "tests": 51_600}
 """Lines: of the product, of its core, and of the tests."""
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
