@@ -51,7 +51,7 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
     for source in config.sources:
         if source.horizons and source.horizons != (setting.horizon,):
             about = f"answers of {source.name} have {span_of(source.horizons)} actions, not {setting.horizon}"
-            warnings.append(RunWarning("other-horizon", about, "set `horizon`, and `control_hz`, to the policy's"))
+            warnings.append(RunWarning("other-horizon", about, "set --horizon, and --control-hz, to the policy's"))
     for each in {cell.latencies.source.name: cell.latencies for cell in tried if cell.rule in PROMISING}.values():
         name, recorded = each.source.name, each.source.recorded_ns is not None
         if recorded and (changed := changes(setting, name, each)):
